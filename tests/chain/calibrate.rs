@@ -24,6 +24,7 @@ every_nth_integration = 60
 baseline_wavelengths_max = 400.0
 model = "direct"
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-4
 rows = "centre"

@@ -20,6 +20,7 @@ every_nth_window = 300
 every_nth_integration = 2
 baseline_wavelengths_max = 24.0
 [map]
+engine = 'pixel'
 nside = 8
 epsilon = 1e-4
 [products]

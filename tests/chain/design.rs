@@ -24,6 +24,7 @@ every_nth_window = 20
 every_nth_integration = 10
 baseline_wavelengths_max = 4.0
 [map]
+engine = 'pixel'
 nside = 4
 [products]
 pictures = false
@@ -44,9 +45,8 @@ fn estimates_are_those_of_dense_equations() {
     let sets = [&sets[..], &more].concat();
     // Settings of a proposal come from files.
     let text = THREE.replace("satellites = 3", "satellites = 4").replace("[600, 1500]", "[600, 1200, 1700]");
-    let pipeline = text
-        .replace("every_nth_window = 20", "every_nth_window = 6")
-        .replace("[map]\nnside = 4", "[map]\nnside = 8");
+    let pipeline =
+        text.replace("every_nth_window = 20", "every_nth_window = 6").replace("\nnside = 4", "\nnside = 8");
     let pipeline = place.file("four.toml", pipeline.as_bytes());
     let downlink = place.simulate("four.ccsds", &sets);
     let (table, sky) = (place.path("visibilities.csv"), place.path("sky.fits"));

@@ -26,6 +26,7 @@ every_nth_integration = 2
 flag_earth = false
 baseline_wavelengths_max = 16.0
 [map]
+engine = 'pixel'
 nside = 4
 baseline_bp_max = 4.5
 epsilon = 1e-4

@@ -25,6 +25,7 @@ every_nth_window = 12
 every_nth_integration = 15
 baseline_wavelengths_max = 16.0
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-4
 [products]

@@ -30,6 +30,7 @@ thermal_noise = false
 flag_earth = false
 model = "direct"
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-4
 [products]

@@ -6,7 +6,7 @@ use crate::common;
 
 use std::path::Path;
 
-use common::workplace::{Workplace, fail, json, maps, succeed};
+use common::workplace::{Workplace, fail, json, lunarray, maps, succeed};
 use lunarray::downlink::{Contents, DownlinkReader};
 use lunarray::frames::GroundFrame;
 use lunarray::pipeline::{ConfigSource, Plan};
@@ -32,6 +32,7 @@ channels_hz = [3.0e6]
 every_nth_window = 100
 thermal_noise = false
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-6
 baseline_bp_max = 10.0
@@ -88,6 +89,7 @@ every_nth_window = 40
 integration_s_max = 600.0
 thermal_noise = false
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-6
 baseline_bp_max = 10.0
@@ -250,6 +252,11 @@ fn a_triple_on_ellipses_is_mapped_by_refinement() {
     let rho: Vec<f64> =
         channel["rho"].as_array().unwrap().iter().map(|rho| rho.as_f64().unwrap_or(0.0)).collect();
     assert!(rho[1..=6].iter().all(|rho| *rho > 0.9), "{rho:?}");
+    // A ground that knows nothing of the orbits takes a circle, and says what to do.
+    let (sent, lone) = (format!("{out}/downlink.ccsds"), place.file("lone.toml", b"[map]\nnside = 4\n"));
+    let found = lunarray(&["replay", &sent, "--map", &lone, "--out", &place.path("lone")]);
+    let said = [found.stdout, found.stderr].concat();
+    assert!(String::from_utf8_lossy(&said).contains("the satellites do not share a circle: map.engine"));
     // The ground alone makes the same map.
     let (downlink, ground) = (format!("{out}/downlink.ccsds"), place.path("ground"));
     let replay =

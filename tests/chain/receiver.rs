@@ -27,6 +27,7 @@ thermal_noise = false
 auto_powers = true
 auto_integration_s = 500.0
 [map]
+engine = 'pixel'
 nside = 4
 "#;
 

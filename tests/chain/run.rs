@@ -24,6 +24,7 @@ every_nth_window = 200
 every_nth_integration = 3
 baseline_wavelengths_max = 16.0
 [map]
+engine = 'pixel'
 nside = 8
 epsilon = [1e-6, 1e-4]
 snapshot_every_s = 1.5e7

@@ -22,6 +22,7 @@ every_nth_window = 60
 every_nth_integration = 4
 baseline_wavelengths_max = 8.0
 [map]
+engine = 'pixel'
 nside = 4
 [products]
 pictures = false
@@ -213,7 +214,7 @@ fn maps_with_an_r_by_degree_are_those_of_dense_matrices() {
     for (engine, fine, tolerance) in [("pixel", 8, 1e-4), ("free", 8, 1e-4), ("refined", 64, 0.02)] {
         let pipeline = match engine {
             "refined" => {
-                let harmonic = pipeline.replace("[map]\n", "[map]\nengine = \"harmonic\"\n");
+                let harmonic = pipeline.replace("engine = 'pixel'", "engine = 'harmonic'");
                 harmonic + "[map.refine]\npasses_max = 20\nresidual_max = 1e-6\n"
             }
             _ => pipeline.replace("nside = 8\n", "nside = 8\nrows = \"centre\"\n"),

@@ -23,6 +23,7 @@ baseline_wavelengths_max = 16.0
 [downlink]
 packet_bytes_max = 2048
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-4
 [products]

@@ -35,6 +35,7 @@ baseline_wavelengths_max = 16.0
 [downlink]
 packet_bytes_max = 1024
 [map]
+engine = 'pixel'
 nside = 2
 epsilon = 1e-4
 [products]

@@ -49,7 +49,10 @@ impl Ground {
 
     /// With one more line for the section `[map]`.
     fn with(engine: &str) -> Self {
-        Self(Workplace::new(&SMALL.replace("[map]", if engine.is_empty() { "[map]" } else { engine })))
+        Self(Workplace::new(&SMALL.replace(
+            "[map]\nengine = 'pixel'",
+            if engine.is_empty() { "[map]\nengine = 'pixel'" } else { engine },
+        )))
     }
 
     fn downlink(&self) -> String {

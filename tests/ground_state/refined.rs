@@ -16,7 +16,7 @@ fn copy_of(segment: &Path) -> PathBuf {
 pub const REFINED: &str = "[map]\nengine = \"harmonic\"\nresidual_max = 1e-9\nrefine = { passes_max = 2 }";
 
 /// A dozen products show all that more would: they begin at nothing.
-const MATRIX_FREE: &str = "[map]\nmatrix = \"free\"\niterations_max = 12";
+const MATRIX_FREE: &str = "[map]\nengine = \"pixel\"\nmatrix = \"free\"\niterations_max = 12";
 
 fn segments(folder: &str) -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> =

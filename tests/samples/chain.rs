@@ -37,6 +37,7 @@ fn mapped(folder: &std::path::Path, name: &str, more: &[&str]) -> (Vec<f64>, Vec
         flag_earth = false # the last daughters see the Earth for 64 s of a window
         baseline_wavelengths_max = 24.0
         [map]
+        engine = 'pixel'
         nside = 8
         rows = "centre"
         epsilon = 1e-3

@@ -214,6 +214,7 @@ const PIPELINE: &str = r#"
     integration_s = 2.0
     file_index = -2.5
     [map]
+    engine = 'pixel'
     nside = 2
     epsilon = [1e-2, 1e-1]
     [products]

@@ -162,6 +162,7 @@ fn downlinked(sky: &Path, fidelity: &str, seed: u64) -> Vec<VisibilityBlock> {
         auto_integration_s = 1.024
         auto_powers = true
         [map]
+        engine = 'pixel'
         nside = 4
     "#;
     let folder = tempfile::tempdir().unwrap();

@@ -25,6 +25,7 @@ const PIPELINE: &str = r#"
     flag_earth = false # the last daughters see the Earth for 64 s of a window
     baseline_wavelengths_max = 24.0
     [map]
+    engine = 'pixel'
     nside = 4
     epsilon = 1e-2
     [products]

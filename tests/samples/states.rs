@@ -28,6 +28,7 @@ packet_bytes_max = 512
 [calibration]
 quantiser_bits = 2
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-2
 "#;

@@ -19,6 +19,7 @@ every_nth_window = 300
 every_nth_integration = 2
 baseline_wavelengths_max = 16.0
 [map]
+engine = 'pixel'
 nside = 4
 beams_deg = [[0.0, 90.0]]
 [products]

@@ -33,6 +33,7 @@ model = "direct"
 [downlink]
 packet_bytes_max = 2048
 [map]
+engine = 'pixel'
 nside = 4
 epsilon = 1e-4
 rows = "centre"

@@ -133,6 +133,7 @@ fn is_above(value: &Value, limit: &Value) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::imaging::EngineKind;
     use crate::pipeline::ConfigSource;
 
     /// Three satellites on an ellipse.
@@ -142,7 +143,11 @@ mod tests {
         { semi_major_axis_m = 2e6, eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.3 }]";
 
     fn messages(text: &str) -> Vec<String> {
-        let config: Config = toml::from_str(text).unwrap();
+        let mut config: Config = toml::from_str(text).unwrap();
+        // An engine is chosen before; here of pixels where none is named.
+        if config.map.engine == EngineKind::Auto {
+            config.map.engine = EngineKind::Pixel;
+        }
         config.problems().iter().map(ToString::to_string).collect()
     }
 

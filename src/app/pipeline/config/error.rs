@@ -9,10 +9,27 @@ use super::problems::Problems;
 use crate::array::ArrayError;
 use crate::frames::{SampleReason, VisibilityReason};
 use crate::response::MeasuredAntennasError;
-use crate::runtime::{LedgerImbalance, RuntimeError};
+use crate::runtime::{LedgerImbalance, LedgerReport, RuntimeError};
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
 use crate::units::bytes_text;
+
+/// Share of the visibilities of a run, refused for their positions, from which on its map has the wrong engine.
+const OFF_CIRCLE_SHARE: f64 = 0.1;
+
+/// What to do where the harmonic engine refused many visibilities for their positions; a line, or nothing.
+pub(in crate::pipeline) fn advice_off_circle(ledger: &LedgerReport<VisibilityReason>) -> &'static str {
+    use VisibilityReason::{OffAltitude, OutOfPlane, UnequalAltitudes};
+    let reasons = [OutOfPlane, OffAltitude, UnequalAltitudes];
+    let refused: u64 = reasons.iter().filter_map(|reason| ledger.left_out.get(reason)).sum();
+    match refused as f64 > OFF_CIRCLE_SHARE * ledger.sampled as f64 {
+        true => {
+            "\nmany visibilities were refused, as the satellites do not share a circle: map.engine = \"pixel\" takes them, or \
+             map.refine.passes_max above 0"
+        }
+        false => "",
+    }
+}
 
 /// Maximum length of a pipeline file, bytes; a hundred times that of a file with every key.
 pub(super) const FILE_BYTES_MAX: u64 = 1 << 20;
@@ -153,14 +170,15 @@ pub enum PipelineError {
     },
     /// No data for any map.
     #[error(
-        "no visibility of a pair could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",
-        summary.display()
+        "no visibility of a pair could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}{}",
+        summary.display(),
+        advice_off_circle(ledger)
     )]
     NoMap {
         /// Path of the summary.
         summary: std::path::PathBuf,
         /// The ledger of visibilities.
-        ledger: Box<crate::runtime::LedgerReport<VisibilityReason>>,
+        ledger: Box<LedgerReport<VisibilityReason>>,
     },
     /// The last checkpoint of the ground segment could not be written.
     #[error(

@@ -20,6 +20,7 @@ mod source;
 pub(super) use downlink_settings::SETTINGS;
 pub use downlink_settings::SettingsOrigin;
 pub use effects::{NoEffect, condition_text};
+pub(in crate::pipeline) use error::advice_off_circle;
 pub use error::{ConfigError, PipelineError};
 pub use memory::{MemoryLimit, MemorySource};
 pub use plan::{Expected, Plan};

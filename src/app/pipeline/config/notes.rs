@@ -64,20 +64,9 @@ impl Config {
     #[must_use]
     #[doc(hidden)]
     pub fn positions_note(&self) -> Option<String> {
-        let (map, calibration) = (&self.map, &self.calibration);
-        let limits = &map.limits;
-        let are_narrow = limits.out_of_track_deg_max.min(limits.radial_deg_max) < CORRECTED_DEG;
-        if map.method() != Method::Harmonic || !are_narrow {
-            return None;
-        }
-        let has_positions =
-            |path: &PathBuf| GainsFile::read(path).is_ok_and(|file| !file.positions.is_empty());
-        let corrects = match calibration.hook {
-            CalibrationHook::AntennaGains => calibration.gains_file.as_ref().is_some_and(has_positions),
-            CalibrationHook::Solve => self.calibrate.position_sigma_m > 0.0,
-            CalibrationHook::Identity => false,
-        };
-        corrects.then(|| {
+        let limits = &self.map.limits;
+        let is_refused = self.map.method() == Method::Harmonic && self.has_narrow_limits();
+        (is_refused && self.corrects_positions()).then(|| {
             format!(
                 "errors of corrected positions put them off the common circle (3.5 m are {CORRECTED_DEG} deg of a baseline of 100 m), \
                  and the harmonic engine refuses baselines beyond map.limits.out_of_track_deg_max = {} and \
@@ -85,6 +74,23 @@ impl Config {
                 limits.out_of_track_deg_max, limits.radial_deg_max
             )
         })
+    }
+
+    /// Whether the harmonic engine refuses short baselines between positions that are metres off the circle.
+    pub(super) fn has_narrow_limits(&self) -> bool {
+        let limits = &self.map.limits;
+        limits.out_of_track_deg_max.min(limits.radial_deg_max) < CORRECTED_DEG
+    }
+
+    /// Whether calibration changes positions.
+    pub(super) fn corrects_positions(&self) -> bool {
+        let has_positions =
+            |path: &PathBuf| GainsFile::read(path).is_ok_and(|file| !file.positions.is_empty());
+        match self.calibration.hook {
+            CalibrationHook::AntennaGains => self.calibration.gains_file.as_ref().is_some_and(has_positions),
+            CalibrationHook::Solve => self.calibrate.position_sigma_m > 0.0,
+            CalibrationHook::Identity => false,
+        }
     }
 
     /// A note if the orbital period does not fit the altitude.

@@ -197,11 +197,14 @@ impl Config {
         }
     }
 
-    /// Replaces `map.engine = "auto"` by what the orbits allow.
+    /// Replaces `map.engine = "auto"` by what orbits, positions and the other settings of maps allow.
     pub(super) fn choose_engine(&mut self) {
         if self.map.engine == EngineKind::Auto {
-            let harmonic = self.array.is_circle() || self.map.refine.is_on();
-            self.map.engine = if harmonic { EngineKind::Harmonic } else { EngineKind::Pixel };
+            let shares_circle = self.array.is_circle() && !self.map.has_pixel_settings();
+            let leaves_circle = self.navigation.has_position_errors() || self.corrects_positions();
+            let is_harmonic = shares_circle && !(leaves_circle && self.has_narrow_limits());
+            let is_harmonic = is_harmonic || self.map.refine.is_on();
+            self.map.engine = if is_harmonic { EngineKind::Harmonic } else { EngineKind::Pixel };
         }
     }
 

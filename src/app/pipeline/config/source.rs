@@ -270,8 +270,19 @@ mod tests {
     /// The default pipeline is for any orbits: its engine is one that they allow.
     #[test]
     fn the_embedded_pipeline_takes_any_orbits() {
-        let cases: [(&[&str], EngineKind); 4] = [
+        let cases: [(&[&str], EngineKind); 8] = [
             (&[], EngineKind::Harmonic),
+            // Keys that only pixels have, and positions that leave the circle by metres.
+            (&["map.matrix='free'"], EngineKind::Pixel),
+            (&["navigation.across_m.constant_rms=3.0"], EngineKind::Pixel),
+            (&["calibration.hook='solve'", "calibrate.position_sigma_m=10"], EngineKind::Pixel),
+            (
+                &[
+                    "navigation.across_m.constant_rms=3.0",
+                    "map.limits={out_of_track_deg_max=2.0, radial_deg_max=2.0}",
+                ],
+                EngineKind::Harmonic,
+            ),
             (&["array.eccentricity=0.01"], EngineKind::Pixel),
             (&["array.cross_track_ratio=0.1"], EngineKind::Pixel),
             (&["array.eccentricity=0.01", "map.refine.passes_max=3"], EngineKind::Harmonic),
@@ -492,7 +503,8 @@ mod tests {
     #[test]
     fn a_ground_without_a_file_takes_any_number_of_channels() {
         let config = ConfigSource::default().load_ground().unwrap();
-        assert_eq!((config.map, config.name.as_str()), (MapConfig::default(), "lunarray"));
+        let map = MapConfig { engine: EngineKind::Harmonic, ..MapConfig::default() };
+        assert_eq!((config.map, config.name.as_str()), (map, "lunarray"));
         let told =
             with(&["spacecraft.channels_hz=[3e6]", "map.epsilon=[1e-4, 1e-6, 1e-4]"]).unwrap().problems();
         let told: Vec<String> = told.iter().map(ToString::to_string).collect();

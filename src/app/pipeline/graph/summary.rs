@@ -16,7 +16,7 @@ use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenReport;
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
-use crate::pipeline::config::Config;
+use crate::pipeline::config::{Config, advice_off_circle};
 use crate::products::{ChannelSummary, JOINT, JointReport, ProductsError, write_product};
 use crate::runtime::{LedgerReport, Report, StageReport};
 
@@ -296,7 +296,8 @@ fn product_files(summary: &[u8]) -> Vec<String> {
 impl fmt::Display for RunSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "Stages\n{}\n", self.report)?;
-        writeln!(f, "Ledger of visibilities\n{}\n{}\n", self.ledger, self.completeness)?;
+        let advice = advice_off_circle(&self.ledger);
+        writeln!(f, "Ledger of visibilities\n{}{advice}\n{}\n", self.ledger, self.completeness)?;
         if let Some(samples) = &self.samples {
             writeln!(f, "Samples\n{samples}\n")?;
         }

@@ -41,11 +41,11 @@ pub type ChannelGroup = BTreeSet<ChannelId>;
 #[non_exhaustive]
 pub enum EngineKind {
     /// Pixels: exact, for any orbit; N_pix^2 operations per visibility.
-    #[default]
     Pixel,
     /// Spherical harmonics: thousands of operations per visibility; needs satellites on one circular orbit.
     Harmonic,
-    /// The cheaper one that the orbits of `[array]` allow: replaced by it when a pipeline is read, and otherwise the same as [`Self::Pixel`].
+    /// The cheaper one that the pipeline allows: replaced by it when a pipeline is read, and otherwise the same as [`Self::Pixel`].
+    #[default]
     Auto,
 }
 
@@ -95,9 +95,9 @@ keys! {
         /// HEALPix nside of the maps: a power of two up to 64 (engine "pixel"), 256 (with matrix = "free") or 1024 (engine
         /// "harmonic").
         everyday nside: usize = 16;
-        /// Map method: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or with
-        /// map.refine; or "auto": "harmonic" if the orbits of section `array` allow it.
-        everyday engine: EngineKind = EngineKind::Pixel;
+        /// Map method: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or with map.refine; or
+        /// "auto": "harmonic" if section `array` has a circle, positions keep to it, and no key of pixel maps is set.
+        everyday engine: EngineKind = EngineKind::Auto;
         /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
         expert channels_max: usize = 64;
         /// Channels to map, from 0; all if empty.
@@ -350,6 +350,12 @@ impl MapConfig {
             Method::Refined => settings.push(("map.refine.passes_max", REFINED.to_owned())),
         }
         settings
+    }
+
+    /// Whether something is set that only maps over pixels have.
+    #[must_use]
+    pub fn has_pixel_settings(&self) -> bool {
+        self.matrix != MatrixKind::default() || self.rows != PixelMethod::default()
     }
 
     /// What the rows of a refined map are made with.

@@ -233,6 +233,22 @@ impl<'a> Posterior<'a> {
         view.coefficients(self.prior(), &self.offsets, unknowns)
     }
 
+    /// Amplitudes of the mean and of the dipole (rms of its three coefficients) in each channel, K sr^(1/2).
+    pub(super) fn amplitudes_of_free(&self) -> Vec<[f64; FREE]> {
+        let of_channel = |channel: usize| {
+            let view = self.prior().view_of(channel);
+            let mut squares = [0.0; FREE];
+            for (l, x) in degrees(view.l_max).zip(self.coefficients(&view, &self.solution)) {
+                if let Some(square) = squares.get_mut(l) {
+                    *square += x * x / (2 * l + 1) as f64;
+                }
+            }
+            // Of a sky without mean or dipole any amplitude serves.
+            squares.map(|square| if square > 0.0 { square.sqrt() } else { 1.0 })
+        };
+        (0..self.prior().channels()).map(of_channel).collect()
+    }
+
     /// Ratio of the variances of posterior samples and those of the blocks by degree, averaged over neighbouring degrees for accuracy.
     fn variance_ratio(&self, view: &View) -> Vec<f64> {
         let mut sums = vec![[0.0; 2]; view.l_max + 1];
@@ -288,7 +304,7 @@ impl<'a> Posterior<'a> {
         let map_k = synthesis(&coefficients(&sky, view.l_max), nside)?;
         let factors = Factors::new(&self.blocks, &unit_regularisation(self.prior()));
         let row = |channel: usize, l: usize| {
-            let shares = if l < FREE { &view.shares_of_free } else { &view.shares };
+            let shares = view.shares_of_free.get(l).unwrap_or(&view.shares);
             let has_unknown = l <= view.l_max && channel < shares.len();
             if has_unknown { ratio[l].sqrt() * view.scale[l] * shares[channel] } else { 0.0 }
         };

@@ -70,7 +70,7 @@ pub(super) struct View {
     /// Coefficients q of the channels; at each degree only channels with this degree contribute.
     pub(super) shares: Vec<f64>,
     /// Coefficients q for mean and dipole, which have no independent fraction.
-    pub(super) shares_of_free: Vec<f64>,
+    pub(super) shares_of_free: [Vec<f64>; FREE],
     /// Variance of `x_lm / s_l` that no channel determines, by degree; 0 at the frequency of a channel.
     pub(super) undetermined: Vec<f64>,
 }
@@ -150,14 +150,17 @@ impl Prior {
             frequency_hz: self.frequencies_hz[channel],
             l_max: self.l_max[channel],
             scale: self.scale[channel].clone(),
-            shares_of_free: shares.clone(),
+            shares_of_free: std::array::from_fn(|_| shares.clone()),
             shares,
             undetermined: vec![0.0; self.l_max[channel] + 1],
         }
     }
 
     /// The view at any frequency in the range of the channels: the conditional mean given the channels.
-    pub(super) fn view_at(&self, frequency_hz: f64) -> Result<View, SolveError> {
+    ///
+    /// Mean and dipole have no prior power to scale them, and that of other degrees scatters from channel to channel. So they are given
+    /// relative to `free`, amplitudes of mean and dipole in each channel: between channels these follow power laws.
+    pub(super) fn view_at(&self, frequency_hz: f64, free: &[[f64; FREE]]) -> Result<View, SolveError> {
         if let Some(channel) = self.frequencies_hz.iter().position(|channel_hz| *channel_hz == frequency_hz) {
             return Ok(self.view_of(channel));
         }
@@ -178,7 +181,7 @@ impl Prior {
         let l_max = self.l_max[below].min(self.l_max[above]);
         let [low, high] = [below, above].map(|channel| self.frequencies_hz[channel]);
         let share = (frequency_hz / low).ln() / (high / low).ln();
-        let ln = |channel: usize, l: usize| self.scale[channel][l].ln();
+        let ln = |channel: usize, l: usize| free[channel].get(l).unwrap_or(&self.scale[channel][l]).ln();
         let scale =
             (0..=l_max).map(|l| ((1.0 - share) * ln(below, l) + share * ln(above, l)).exp()).collect();
         let shares = conditional(&self.factor, self.likeness, &self.frequencies_hz, frequency_hz);
@@ -197,10 +200,15 @@ impl Prior {
         // q' factor^-1 are the coefficients of the channels' maps; they are converted to coefficients of the unknowns.
         let mut map_weights = Mat::from_fn(smooth_shares.len(), 1, |k, _| smooth_shares[k]);
         solve_upper_triangular_in_place(factor.as_ref().transpose(), map_weights.as_mut(), Par::Seq);
-        let of_unknown = |source: usize| {
-            (0..self.channels()).map(|channel| map_weights[(channel, 0)] * self.share(channel, source)).sum()
+        let of_unknown = |l: usize, source: usize| {
+            let of_channel = |channel: usize| {
+                let relative = self.scale[channel][l] / free[channel][l];
+                map_weights[(channel, 0)] * relative * self.share(channel, source)
+            };
+            (0..self.channels()).map(of_channel).sum()
         };
-        let shares_of_free = (0..self.channels()).map(of_unknown).collect();
+        let shares_of_free =
+            std::array::from_fn(|l| (0..self.channels()).map(|source| of_unknown(l, source)).collect());
         Ok(View { frequency_hz, l_max, scale, shares, shares_of_free, undetermined })
     }
 }
@@ -212,7 +220,7 @@ impl View {
             let of_channel = |(channel, q): (usize, &f64)| {
                 q * u[offsets[channel] + index_of(prior.l_max[channel], l, m, part)]
             };
-            let shares = if l < FREE { &self.shares_of_free } else { &self.shares };
+            let shares = self.shares_of_free.get(l).unwrap_or(&self.shares);
             let sum: f64 =
                 shares.iter().enumerate().take(prior.channels_with_degree(l)).map(of_channel).sum();
             self.scale[l] * sum
@@ -287,13 +295,45 @@ mod tests {
     fn a_frequency_between_is_the_most_likely_given_its_neighbours() {
         let likeness = Correlation { length: 1.0, own_share: 0.0 };
         let prior = Prior::new(vec![4e6, 9e6], vec![vec![2.0; 3], vec![1.0; 3]], likeness).unwrap();
-        let view = prior.view_at(6e6).unwrap();
+        let free = [[2.0; FREE], [1.0; FREE]];
+        let view = prior.view_at(6e6, &free).unwrap();
         let (r, q) = ((-0.5 * (9.0_f64 / 4.0).ln().powi(2)).exp(), (-0.5 * 1.5_f64.ln().powi(2)).exp());
         // rho' C^-1 rho for rho = (q, q), C = (1 r; r 1).
         let explained = 2.0 * q * q / (1.0 + r);
         assert!((view.undetermined[2] - (1.0 - explained)).abs() < 1e-12, "{:?}", view.undetermined);
         // At the geometric mean of 4 and 9 MHz the scale is the geometric mean of both channels' scales.
         assert!((view.scale[1] - 2.0_f64.sqrt()).abs() < 1e-12);
-        assert!(prior.view_at(3e6).is_err() && prior.view_at(10e6).is_err());
+        assert!(prior.view_at(3e6, &free).is_err() && prior.view_at(10e6, &free).is_err());
+    }
+
+    /// A mean that falls as frequency to the -2.5 stays so between channels, however the estimated powers of the channels scatter.
+    #[test]
+    fn a_mean_between_channels_follows_a_power_law() {
+        let (frequencies_hz, scatter) = (vec![10e6, 5e6, 3e6], [1.2, 0.8, 1.15]);
+        let law = |hz: f64| (hz / 1e7).powf(-2.5);
+        let scale = |(hz, scatter): (&f64, f64)| vec![1e3 * scatter * law(*hz); 3];
+        let scale = frequencies_hz.iter().zip(scatter).map(scale).collect();
+        let likeness = Correlation { length: 1.5, own_share: 0.01 };
+        let prior = Prior::new(frequencies_hz.clone(), scale, likeness).unwrap();
+        let (offsets, count) = prior.offsets();
+        // Unknowns of which the channels' means are the law, by forward substitution.
+        let mut u = vec![0.0; count];
+        for channel in 0..prior.channels() {
+            let share = |source: usize| prior.share(channel, source) * prior.scale[channel][0];
+            let known: f64 = (0..channel).map(|source| share(source) * u[offsets[source]]).sum();
+            u[offsets[channel]] = (law(frequencies_hz[channel]) - known) / share(channel);
+        }
+        let free: Vec<[f64; FREE]> = frequencies_hz.iter().map(|hz| [law(*hz), 1.0]).collect();
+        for hz in [4e6, 7e6, 9e6] {
+            let view = prior.view_at(hz, &free).unwrap();
+            let found = view.coefficients(&prior, &offsets, &u)[0];
+            // The prior pulls to zero by half of what it leaves undetermined, here less than 2 %.
+            let relative = found / law(hz) - 1.0;
+            assert!(
+                relative.abs() < 0.01 && view.undetermined[0] < 0.02,
+                "{hz} {relative} {:?}",
+                view.undetermined
+            );
+        }
     }
 }

@@ -149,8 +149,9 @@ pub fn solve_jointly(
     let (joint, approximation, start) = equations.with_powers(&rows, request, watch)?;
     let posterior = Posterior::new(&joint, &approximation, request, start.as_deref(), watch)?;
     let mut views = (0..prior.channels()).map(|channel| prior.view_of(channel)).collect::<Vec<View>>();
+    let free = posterior.amplitudes_of_free();
     for &at_hz in &request.at_hz {
-        views.push(prior.view_at(at_hz)?);
+        views.push(prior.view_at(at_hz, &free)?);
     }
     let nside_of = |view: &View| {
         let own = channels.iter().find(|channel| channel.frequency_hz == view.frequency_hz);

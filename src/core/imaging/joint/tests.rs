@@ -176,7 +176,7 @@ fn compare(
     let found = Posterior::new(&joint, &approximation, &request, None, watch.named("test")).unwrap();
     assert!(found.convergence.converged);
 
-    let at_seven = prior.view_at(7e6).unwrap();
+    let at_seven = prior.view_at(7e6, &found.amplitudes_of_free()).unwrap();
     let (expected, covariance) = posterior_of_dense([&scale[0], &scale[1], &at_seven.scale], expected);
     let count = covariance.nrows();
     let views = [prior.view_of(0), prior.view_of(1), at_seven];

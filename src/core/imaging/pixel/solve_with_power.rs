@@ -68,7 +68,8 @@ pub fn solve_pixels_with_power(
         data_chi2: power - predicted,
         data_count: numbers,
     };
-    let found = problem.solve_blocks()?;
+    let hidden = HiddenSky::new(sums);
+    let found = problem.solve_blocks(&|x| Ok(hidden.is_plausible(&to_pixels(x)?)))?;
     let factors = Factors::new(&blocks, &found.regularisation);
     let solved = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
         let mut x = harmonics_of(map)?;
@@ -97,6 +98,43 @@ pub fn solve_pixels_with_power(
     let diagnostics = Diagnostics::of_power(l_max, &[]);
     let noise_k = solved(&sums.noise)?;
     Ok((PixelSolution { map_k, noise_k, beams, diagnostics }, uncertainty))
+}
+
+/// Pixels that no visibility saw, or hardly any.
+struct HiddenSky {
+    is_hidden: Vec<bool>,
+}
+
+/// Pixels with less than this share of the greatest weight are hidden.
+const HIDDEN_WEIGHT: f64 = 0.01;
+/// Least share of hidden pixels for which the map is judged.
+const HIDDEN_SHARE: f64 = 0.02;
+/// A hidden sky that is rougher than the rest by this factor (rms about the mean) is no sky: R expects the same of both, and that where
+/// nothing is measured the map is smooth.
+const ROUGHER: f64 = 2.0;
+
+impl HiddenSky {
+    fn new(sums: &PixelSums) -> Self {
+        let weights: Vec<f64> = (0..sums.unknowns()).map(|pixel| sums.normal.get(pixel, pixel)).collect();
+        let greatest = weights.iter().copied().fold(0.0, f64::max);
+        Self { is_hidden: weights.into_iter().map(|weight| weight < HIDDEN_WEIGHT * greatest).collect() }
+    }
+
+    /// Whether the map's hidden part is not much rougher than the rest.
+    fn is_plausible(&self, map: &[f64]) -> bool {
+        let part = |hidden: bool| {
+            let of_part = map.iter().zip(&self.is_hidden).filter(|(_, is_hidden)| **is_hidden == hidden);
+            of_part.map(|(value, _)| *value).collect::<Vec<f64>>()
+        };
+        let (hidden, seen) = (part(true), part(false));
+        if (hidden.len() as f64) < HIDDEN_SHARE * map.len() as f64 || seen.is_empty() {
+            return true;
+        }
+        let mean = seen.iter().sum::<f64>() / seen.len() as f64;
+        let square =
+            |values: &[f64]| values.iter().map(|t| (t - mean).powi(2)).sum::<f64>() / values.len() as f64;
+        square(&hidden) <= ROUGHER.powi(2) * square(&seen)
+    }
 }
 
 /// The equations over harmonics, solved.

@@ -28,6 +28,9 @@ const RATIO_MAX: f64 = 30.0;
 /// Change of the logarithm of the noise factor at which it has converged.
 const FACTOR_TOLERANCE: f64 = 0.03;
 
+/// How often the noise of a map that is not plausible is doubled.
+const DOUBLINGS_MAX: usize = 8;
+
 /// Normal equations whose R is estimated from the data.
 pub(in crate::imaging) struct PowerProblem<'a> {
     pub(in crate::imaging) sums: &'a dyn NormalSums,
@@ -87,11 +90,31 @@ impl PowerProblem<'_> {
     }
 
     /// Estimates the power if the blocks are the whole normal matrix.
-    pub(in crate::imaging) fn solve_blocks(&self) -> Result<FoundPower, SolveError> {
+    ///
+    /// What a map cannot have, structure beyond its degrees for instance, is no white noise: modes that the data hardly see may fit it with
+    /// an enormous sky, which then passes for the sky's power. While the solution is not plausible, the noise counts as twice as large.
+    pub(in crate::imaging) fn solve_blocks(
+        &self,
+        is_plausible: &dyn Fn(&[f64]) -> Result<bool, SolveError>,
+    ) -> Result<FoundPower, SolveError> {
+        let mut least = 1.0;
+        for doubling in 0.. {
+            let found = self.solve_blocks_in_noise(least)?;
+            if doubling == DOUBLINGS_MAX || is_plausible(&found.solution)? {
+                return Ok(found);
+            }
+            least = 2.0 * found.noise_factor();
+        }
+        Err(SolveError::NoPower)
+    }
+
+    /// The same with a noise factor of at least `least`.
+    fn solve_blocks_in_noise(&self, least: f64) -> Result<FoundPower, SolveError> {
         let l_max = self.l_max();
         let gradient_correction = vec![0.0; l_max + 1];
-        let mut fit = PowerFit::begin(self.blocks, l_max, self.right, self.data_chi2)?;
-        let mut factor = 1.0;
+        let mut factor = least;
+        let (right, data_chi2) = (self.right_divided_by(factor), self.data_chi2 / factor.powi(2));
+        let mut fit = PowerFit::begin(self.blocks, l_max, &right, data_chi2)?;
         for round in 1.. {
             let right = self.right_divided_by(factor);
             let data =
@@ -101,7 +124,7 @@ impl PowerProblem<'_> {
             let factors = Factors::new(self.blocks, &regularisation);
             let mut solution = self.right.to_vec();
             factors.solve(&mut solution);
-            let next_factor = self.noise_factor(&solution, &regularisation);
+            let next_factor = self.noise_factor(&solution, &regularisation).max(least);
             if round >= ROUNDS_MAX || (next_factor / factor).ln().abs() < FACTOR_TOLERANCE {
                 let (power, covariance) = fit.estimate(data, &factors.traces(l_max))?;
                 return Ok(FoundPower {

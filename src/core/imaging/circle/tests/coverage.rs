@@ -168,7 +168,7 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
             // So many that residuals are noise.
             data_count: f64::INFINITY,
         };
-        let found = sought.solve_blocks().unwrap();
+        let found = sought.solve_blocks(&|_| Ok(true)).unwrap();
         let factors = Factors::new(&blocks, &found.regularisation);
         let sigma_k = pixel_sigma_k(&blocks, &factors, &found.ratio, nside);
         let truth = lower(&sky, l_max);
