@@ -112,6 +112,29 @@ fn stations_on_the_moon_map_the_sky() {
     assert_replayed(&place, &out);
 }
 
+/// From latitude 30 a cap of the sky is always below the horizon. What the map cannot have of the rest, structure within its pixels, must not
+/// be fitted by an enormous sky in there, which would pass for the sky's power.
+#[test]
+fn stations_that_never_see_a_part_of_the_sky_map_the_rest() {
+    let text = include_str!("../../pipelines/surface.toml");
+    let of_line = |line: &str| -> String {
+        let Some((_, rest)) = line.split_once("longitude_deg = ") else { return line.to_owned() };
+        let (east, north) = rest.split_once(", latitude_deg = ").unwrap();
+        let north: f64 = north.trim_end_matches([' ', '}', ',']).parse().unwrap();
+        // The same distances to the east.
+        let east = 170.0 + (east.parse::<f64>().unwrap() - 170.0) / 30.0_f64.to_radians().cos();
+        format!("{{ longitude_deg = {east:.7}, latitude_deg = {:.7} }},", 30.0 + north)
+    };
+    let place = Workplace::new(&text.lines().map(of_line).collect::<Vec<_>>().join("\n"));
+    let out = place.path("out");
+    let sets = ["spacecraft.every_nth_window=64", "sky.nside=32", "products.pictures=false"];
+    let sets: Vec<&str> = sets.iter().flat_map(|set| ["--set", set]).collect();
+    let summary = json(&[&["run", &place.pipeline, "--out", &out], &sets[..]].concat());
+    let rho = |l: usize| summary["channels"][0]["rho"][l].as_f64().unwrap();
+    // The hidden cap is 7 % of the sky, and its smooth continuation is not wholly wrong.
+    assert!((2..=8).all(|l| rho(l) > 0.9), "{:?}", (2..=8).map(rho).collect::<Vec<_>>());
+}
+
 #[test]
 fn what_stations_cannot_do_is_refused() {
     let place = Workplace::new(SURFACE);
