@@ -79,7 +79,7 @@ def main():
     nside, mhz = int(sys.argv[1]), float(sys.argv[2])
     wanted = int(sys.argv[3]) if len(sys.argv) > 3 else {8: 1200}.get(nside, 3600)
     wavelength, pixels = LIGHT / (1e6 * mhz), hp.nside2npix(nside)
-    directions = fine_directions(max(64, 4 * nside))
+    directions = fine_directions(max(64, 8 * nside))
     limit = 2 * wavelength / np.sqrt(4 * np.pi / pixels)
     pairs, pair_time = sampled_pairs(limit, wanted)
     parts = (part for pair in pairs for part in fine_row(directions, *pair, wavelength))
