@@ -418,7 +418,7 @@ def sensitivity(cases, *how):
 
 PIPELINE = "pipelines/paper-10mhz.toml"
 # Channels of Fig. 19 at nside 64.
-FIG19_MHZ = (5, 20, 30)
+FIG19_MHZ = (1, 5, 20, 30)
 
 
 def study(name, rest="", folder="pipelines/paper"):
