@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The paper's traces and map noise by dense matrices over pixels, in numpy and healpy: shares no code with lunarray.
+"""The paper's traces, map noise and its scatter by dense matrices over pixels, in numpy and healpy: shares no code with lunarray.
 
     python3 pipelines/paper/dense.py NSIDE MHZ [BASELINES]
 
@@ -79,22 +79,24 @@ def main():
     nside, mhz = int(sys.argv[1]), float(sys.argv[2])
     wanted = int(sys.argv[3]) if len(sys.argv) > 3 else {8: 1200}.get(nside, 3600)
     wavelength, pixels = LIGHT / (1e6 * mhz), hp.nside2npix(nside)
-    directions = fine_directions(max(64, 4 * nside))
+    directions = fine_directions(max(64, 8 * nside))
     limit = 2 * wavelength / np.sqrt(4 * np.pi / pixels)
     pairs, pair_time = sampled_pairs(limit, wanted)
     parts = (part for pair in pairs for part in fine_row(directions, *pair, wavelength))
     b = np.array([part.reshape(pixels, -1).mean(1, dtype=np.float32) for part in parts]) * np.float32(4 * np.pi / pixels)
     mean, per_part = mean_sky(mhz), weight(mhz, pair_time, len(pairs))
-    w = np.clip(np.linalg.eigvalsh((b.T @ b).astype(float) * per_part)[::-1], 0, None)
+    w, modes = np.linalg.eigh((b.T @ b).astype(float) * per_part)
+    w = np.clip(w, 0, None)
     jansky = 5 * 2 * BOLTZMANN * (1e6 * mhz / LIGHT) ** 2 / 1e-26
     print(f"nside {nside}, {mhz:g} MHz, b < {limit:.0f} m, {pair_time / 3600:.0f} pair hours, mean {mean:.3e} K")
     print(f"radiometer, 5 sigma: {jansky / np.sqrt(per_part * len(pairs)):.1f} Jy")
-    print("epsilon  Tr Sigma_n/K2  Tr Sigma_s  T2 Tr Sigma_s/K2  T of equality/K  5 sigma, Jy a pixel")
+    print("epsilon  Tr Sigma_n/K2  Tr Sigma_s  T2 Tr Sigma_s/K2  T of equality/K  5 sigma, Jy a pixel  scatter of sigma, %")
     for epsilon in (1e-4, 3e-4, 1e-3, 2e-3, 3e-3, 1e-2, 3e-2, 1e-1):
-        eps = epsilon * w[0]
-        n, s = (w / (w + eps) ** 2).sum(), ((eps / (w + eps)) ** 2).sum()
-        noise = jansky * np.sqrt(n / pixels) * 4 * np.pi / pixels
-        print(f"{epsilon:.0e}  {n:.3e}  {s:.3e}  {mean**2 * s:.3e}  {np.sqrt(n / s):.3e}  {noise:.1f}")
+        eps = epsilon * w[-1]
+        sigma = np.sqrt(modes**2 @ (w / (w + eps) ** 2))
+        n, s = (sigma**2).sum(), ((eps / (w + eps)) ** 2).sum()
+        noise, scatter = jansky * np.sqrt(n / pixels) * 4 * np.pi / pixels, 100 * sigma.std() / sigma.mean()
+        print(f"{epsilon:.0e}  {n:.3e}  {s:.3e}  {mean**2 * s:.3e}  {np.sqrt(n / s):.3e}  {noise:.1f}  {scatter:.1f}")
 
 
 if __name__ == "__main__":

@@ -417,6 +417,8 @@ def sensitivity(cases, *how):
 
 
 PIPELINE = "pipelines/paper-10mhz.toml"
+# Channels of Fig. 19 at nside 64.
+FIG19_MHZ = (1, 5, 20, 30)
 
 
 def study(name, rest="", folder="pipelines/paper"):
@@ -429,6 +431,13 @@ def drawn(name, rest=""):
 
 def sky(mhz, nside=256, rest=""):
     return f"lunarray sky {PIPELINE} --freq-hz {mhz}e6 --nside {nside}{rest}"
+
+
+def sub_pixel_of(task, nside, instants=""):
+    """Command for the appendix's formulas under the sky of out/sub-pixel; its table appears when it is whole."""
+    name = {"matrix": "sub-pixel-matrix", "map": f"sigma-b-{nside}"}[task]
+    made = f"python3 pipelines/paper/sub_pixel.py {task} {nside} out/sub-pixel/10.000MHz/input.fits {instants}".strip()
+    return f"{made} > out/{name}.part && mv out/{name}.part out/{name}.txt"
 
 
 def sheets(ulsa):
@@ -445,7 +454,8 @@ def sheets(ulsa):
         "wrong-prior.fits": "lunarray sky --like out/right-prior.fits --correlation 0.8 --out out/wrong-prior.fits"}
     full = priors | study(FULL[10], under(10)) | study(FULL[3], under(3))
     # A map of no use, for its input, which is the sky itself with pixels as the engine.
-    diffuse = (f"{short} --set map.engine=pixel --set map.matrix=free --set map.iterations_max=1 --set products.frame=ecliptic "
+    useless = f"{short} --set map.engine=pixel --set map.matrix=free --set map.iterations_max=1"
+    diffuse = (f"{useless} --set products.frame=ecliptic "
                f"--set products.smooth_fwhm_deg=0.25{under(10, 'false', ' --set sky.generated.point_sources=false')} --out out/diffuse")
     return [
         ("Fig. 1: a patch, and N(>S)",
@@ -473,6 +483,8 @@ def sheets(ulsa):
          lambda: pixel_traces() + "\n" + traces("fig15-traces")
          + picture("fig15-pixels/study.png", "paper-fig15.png", "rho, SNR, power and traces against epsilon")),
         ("Fig. 16: rows at centres and averaged, rho_l without noise", study("fig16-17-rows"), lambda: rows_of_b("rho", "no noise")),
+        ("Fig. 16: what thinning does", study("fig16-thinning", under(10)) | study("fig16-centres", under(10)),
+         lambda: "\n".join(correlation(name, (8, 16, 20, 24, 28), "case") for name in ("fig16-thinning", "fig16-centres"))),
         ("Fig. 16: at nside 32", study("fig16-nside32"),
          lambda: correlation("fig16-nside32", (8, 16, 20, 24, 32, 48, 64), "limit, rows")),
         ("Fig. 16: at nside 64", study("fig16-nside64"),
@@ -486,22 +498,21 @@ def sheets(ulsa):
              [OUT / "fig19-sensitivity" / case["folder"] for case in load("fig19-sensitivity/study.json")["cases"]], 10, 16)),
         ("Fig. 19: all data at nside 64", full,
          lambda: sensitivity([case_of(10, "1e-3 smoothed"), case_of(3, SMOOTHED[3])], 5)),
-        ("Fig. 19: 30 MHz at nside 64",
-         {"fig19-30mhz/summary.json": f"lunarray run {PIPELINE} --set spacecraft.channels_hz=[30e6] --set map.epsilon=1e-3 "
+        ("Fig. 19: at nside 64",
+         {f"fig19-{mhz}mhz/summary.json": f"lunarray run {PIPELINE} --set spacecraft.channels_hz=[{mhz}e6] --set map.epsilon=1e-3 "
           "--set spacecraft.thermal_noise=false --set products.smooth_fwhm_deg=1 --set products.pictures=false --set sky.nside=128 "
-          "--set sky.l_max=256 --set spacecraft.thin=8 --out out/fig19-30mhz"},
-         lambda: sensitivity([OUT / "fig19-30mhz"], 5, 8)),
+          f"--set sky.l_max=256 --set spacecraft.thin=8 --out out/fig19-{mhz}mhz" for mhz in FIG19_MHZ},
+         lambda: sensitivity([OUT / f"fig19-{mhz}mhz" for mhz in FIG19_MHZ], 5, 8)),
         ("FWHM after post-processing", study("beams"), lambda: point_beams("beams")),
         ("FWHM at nside 64", study("beams-nside64"), lambda: point_beams("beams-nside64")),
         ("Fig. 20: N_b and Sigma_b",
          drawn("sub-pixel") | {
-             "sky-10mhz.fits": sky(10, 256, " --out out/sky-10mhz.fits"),
-             "sub-pixel-matrix.png": "python3 pipelines/paper/sub_pixel.py matrix 8 out/sky-10mhz.fits",
-             "sigma-b-8.txt": "python3 pipelines/paper/sub_pixel.py map 8 out/sky-10mhz.fits 2000 > out/sigma-b-8.txt",
-             "sigma-b-16.txt": "python3 pipelines/paper/sub_pixel.py map 16 out/sky-10mhz.fits 3000 > out/sigma-b-16.part && "
-             "mv out/sigma-b-16.part out/sigma-b-16.txt"},
+             "sub-pixel/summary.json": f"{useless} --set map.nside=256 --set spacecraft.every_nth_integration=1000 "
+             f"--set products.pictures=false{under(10)} --out out/sub-pixel",
+             "sub-pixel-matrix.txt": sub_pixel_of("matrix", 8), "sigma-b-8.txt": sub_pixel_of("map", 8, 2000),
+             "sigma-b-16.txt": sub_pixel_of("map", 16, 8000)},
          lambda: figure("sub-pixel", sub_pixel) + picture("sub-pixel-matrix.png", "paper-sub-pixel-matrix.png", "N_b")
-         + "".join((OUT / f"sigma-b-{nside}.txt").read_text() for nside in (8, 16))),
+         + "\n".join((OUT / f"{name}.txt").read_text() for name in ("sub-pixel-matrix", "sigma-b-8", "sigma-b-16"))),
         ("R from the data: limits of Fig. 16 and 17", study("limits-data"),
          lambda: correlation("limits-data", (4, 8, 16, 32, 48, 64, 80), "R, limit")),
     ]

@@ -1,12 +1,11 @@
 #!/usr/bin/env python3
 """The appendix's N_b and Sigma_b by its formulas, N_b = sum over l, m of conj(Delta b) Delta b' C_l, in numpy and healpy.
 
-    lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 256 --out out/sky-10mhz.fits
-    python3 pipelines/paper/sub_pixel.py matrix 8 out/sky-10mhz.fits
-    python3 pipelines/paper/sub_pixel.py map 8 out/sky-10mhz.fits [BASELINES]
+    python3 pipelines/paper/sub_pixel.py matrix 8 SKY.fits
+    python3 pipelines/paper/sub_pixel.py map 8 SKY.fits [BASELINES]
 
-Delta b is a fringe over pixels 16 times as fine less the model's row, by pixel centres and averaged; C_l is the sky's own. `matrix` takes
-800 instants of one window of the pair whose length is nearest b_p there, and draws the matrices on one scale as out/sub-pixel-matrix.png; `map` takes
+report.py makes the sky. Delta b is a fringe over pixels of nside 128 less the model's row, by pixel centres and averaged; C_l is the sky's
+own. `matrix` takes 800 instants of one window of the pair whose length is nearest b_p there, and draws the matrices on one scale as out/sub-pixel-matrix.png; `map` takes
 random instants of all pairs with b < 2 b_p, and R = 1e-4 W_max I. Beside the formulas stand the residuals V - B T of the sky itself.
 """
 
@@ -20,7 +19,7 @@ import numpy as np
 
 from dense import HALF_BREATH, LIGHT, fine_directions, fine_row, observes, positions, sampled_pairs, weight
 
-MHZ, CHILDREN, INSTANTS, EPSILON = 10.0, 16, 800, 1e-4
+MHZ, FINE, INSTANTS, EPSILON = 10.0, 128, 800, 1e-4
 METHODS = ("centre", "average")
 WAVELENGTH = LIGHT / (1e6 * MHZ)
 # Pixels whose variance `map` sums: each takes one map of the fine pixels.
@@ -31,7 +30,7 @@ class Sky:
     """A map on the fine pixels, NESTED, with its own C_l."""
 
     def __init__(self, nside, path):
-        self.nside, self.fine = nside, CHILDREN * nside
+        self.nside, self.fine = nside, FINE
         ring = hp.ud_grade(hp.read_map(path, dtype=np.float64), self.fine)
         self.l_max = 2 * self.fine
         self.cl = hp.anafast(ring, lmax=self.l_max)
@@ -45,7 +44,7 @@ class Sky:
 
     def rows(self, pair):
         """Both parts of the fringe over the fine pixels, and of the models: at centres and averaged."""
-        parts = [part.reshape(-1, CHILDREN**2) for part in fine_row(self.directions, *pair, WAVELENGTH)]
+        parts = [part.reshape(-1, (self.fine // self.nside) ** 2) for part in fine_row(self.directions, *pair, WAVELENGTH)]
         return parts, (fine_row(self.centres, *pair, WAVELENGTH), [part.mean(1) for part in parts])
 
     def weighted_alm(self, field):
