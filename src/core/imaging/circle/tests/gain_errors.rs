@@ -295,6 +295,8 @@ fn stated_errors_hold_the_truth() {
     let sampled = known.samples.iter().flat_map(|sample| sample.map_k.iter().zip(&map_k).map(|(a, b)| a - b));
     let of_samples = mean_of_squares(&mut sampled.into_iter());
     println!("squares of Gibbs samples over those of the truth: {:.3}", of_samples / of_truth);
+    // Those of 64 draws and of 48 samples scatter by 0.09 and some 0.1: twice that. With errors by gains also in the noise it is above 1.3.
+    assert!((of_samples / of_truth - 1.0).abs() < 0.27, "{of_samples} {of_truth}");
     // Variances from 64 draws scatter by 0.09 (of all pixels together; see above) and that of the mean by 0.18: four times that.
     assert!((within(&known, 1.0) - 0.683).abs() < 0.08 && (within(&known, 1.96) - 0.95).abs() < 0.04);
     assert!((0.5..1.9).contains(&mean_square(&known)), "{}", mean_square(&known));
