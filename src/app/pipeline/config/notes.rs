@@ -46,7 +46,9 @@ impl Config {
     }
 
     /// A note if errors of gains are asked for, and none will be known.
-    fn gain_errors_note(&self) -> Option<String> {
+    #[must_use]
+    #[doc(hidden)]
+    pub fn gain_errors_note(&self) -> Option<String> {
         let (calibration, draws) = (&self.calibration, self.calibration.error_draws);
         let reason = match calibration.hook {
             CalibrationHook::Solve if self.array.satellites > CORRELATED_MAX => {

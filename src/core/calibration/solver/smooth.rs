@@ -178,7 +178,9 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
-    use crate::calibration::solver::ModelVerdict;
+    use crate::calibration::GainSolution;
+    use crate::calibration::solver::{ModelVerdict, gains_file};
+    use crate::frames::Channel;
     use crate::units::{StreamKind, random_stream};
 
     /// The smoother given q is the solution of the normal equations of all values, which are written out here.
@@ -313,6 +315,25 @@ mod tests {
         }
         // Less than one in ten thousand of 8000, as of every gain.
         assert_eq!(beyond, 0);
+    }
+
+    /// Each part tells of the others: draws of their errors are the same, as those of the entries of one solution.
+    #[test]
+    fn parts_that_were_smoothed_have_one_error() {
+        let part = |k: u32| vec![good(300.0 * f64::from(k), [0.0; 2], [0.1; 2]); 2];
+        let mut all = solutions((0..5).map(part).collect());
+        all[2].begins_with_jump = true;
+        all.iter_mut().for_each(|one| one.correlations = vec![vec![[0.0; 2]]]);
+        let file = gains_file(&all, &[Channel { frequency_hz: 3e6, width_hz: 8e3 }], false);
+        let entries = &file.channels[0].solutions;
+        let (before, after): (Vec<&GainSolution>, Vec<_>) =
+            entries.iter().partition(|one| one.time_s < 550.0);
+        let name = |one: &GainSolution| one.errors.as_ref().map(|errors| errors.solution_s);
+        assert!(before.len() > 2 && after.len() > 3);
+        for entries in [&before, &after] {
+            assert!(name(entries[0]).is_some() && entries.iter().all(|one| name(one) == name(entries[0])));
+        }
+        assert_ne!(name(before[0]), name(after[0]));
     }
 
     /// Phases about half a turn, a jump, a part without signal, and the reference.
