@@ -500,7 +500,7 @@ mod tests {
             let config = with(&[&gains, overrides].concat()).unwrap();
             config.ground_value_problems().iter().map(ToString::to_string).collect::<String>()
         };
-        assert_eq!(problems(&[]), "");
+        assert!(!problems(&[]).contains("error_draws"));
         for unused in [["map.engine=pixel"], ["map.regulariser=identity"], ["map.refine.passes_max=3"]] {
             assert!(problems(&unused).contains("calibration.error_draws = 8"), "{unused:?}");
             assert!(!problems(&[unused[0], "calibration.error_draws=0"]).contains("error_draws"));
