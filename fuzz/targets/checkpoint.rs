@@ -17,7 +17,7 @@ static MAPS: LazyLock<[MapConfig; 2]> = LazyLock::new(|| {
 /// A state: length of the head, head, engines.
 fn state(data: &[u8], map: &MapConfig) {
     let Some((length, body)) = data.split_first_chunk::<2>() else { return };
-    let mut file = b"LNRSTA11".to_vec();
+    let mut file = b"LNRSTA12".to_vec();
     file.extend(u64::from(u16::from_le_bytes(*length)).to_le_bytes());
     file.extend(body);
     file.extend(crc_fast::checksum(Crc64Nvme, &file).to_le_bytes());

@@ -198,7 +198,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let named = args.files.iter().chain(&args.map).chain(&args.stations).cloned();
     let _inputs = ProtectedInputs::of(named.chain(config.input_files()));
     use_threads(&config.runtime)?;
-    print_notes(config.positions_note());
+    print_notes([config.positions_note(), config.gain_errors_note()].into_iter().flatten());
     if let Some(size) = args.groups {
         return in_groups(args, &config, size);
     }

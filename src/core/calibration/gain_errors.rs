@@ -71,6 +71,11 @@ impl ErrorTable {
         Self { entries: channel.solutions.iter().map(|one| one.errors.as_ref().map(Entry::new)).collect() }
     }
 
+    /// Whether errors of any entry are stated.
+    pub(super) fn states_any(&self) -> bool {
+        self.entries.iter().any(Option::is_some)
+    }
+
     /// Errors of an entry; `None` if they are not stated.
     pub(super) fn entry(&self, row: usize) -> Option<&Entry> {
         self.entries.get(row)?.as_ref()

@@ -252,8 +252,8 @@ impl Calibration for AntennaGains {
         let pair = block.pair;
         let table = self.table(block.frequency_hz, pair)?;
         let count = block.len();
-        // An auto-correlation is in no map.
-        let draws = if pair.i == pair.j { 0 } else { self.draws };
+        // An auto-correlation is in no map, and draws of a channel without stated errors are zero.
+        let draws = if pair.i == pair.j || !table.errors.states_any() { 0 } else { self.draws };
         let mut drawn = table.errors.drawn((table.frequency_hz, pair), self.seed, draws);
         let mut errors = Vec::with_capacity(draws * count);
         let mut kept = 0;

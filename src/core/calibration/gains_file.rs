@@ -92,16 +92,17 @@ pub struct GainSolution {
     pub time_s: f64,
     /// Real and imaginary part of every satellite's voltage gain.
     pub gains: Vec<[f64; 2]>,
-    /// Errors of these gains; absent if they are not known, as with more than 16 daughters.
+    /// Errors of maps by these gains; absent if there are none, or not known, as with more than 16 daughters.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub errors: Option<GainErrors>,
 }
 
-/// Errors of the gains of one solution, independent of those of other solutions.
+/// Errors that the gains of one solution make in a map, independent of those of other solutions and of the map's noise.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GainErrors {
-    /// Names the solution, s since the mission epoch: entries of one solution, such as of the start and the end of a pass, have one error.
+    /// Names the solution, s since the mission epoch: entries of one solution, such as of the start and the end of a pass, have one error, and
+    /// so have those of solutions that were smoothed together.
     pub solution_s: f64,
     /// Standard deviations of the natural logarithm of the amplitude and of the phase, rad, of every satellite.
     pub sigma: Vec<[f64; 2]>,

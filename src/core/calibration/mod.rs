@@ -40,6 +40,8 @@ pub use gains::AntennaGains;
 pub use gains_file::{ChannelGains, GainErrors, GainSolution, GainsFile, Interpolation, PositionSolution};
 #[doc(hidden)]
 pub use solved::{ClosedPass, SolvedGains};
+#[doc(hidden)]
+pub use solver::CORRELATED_MAX;
 pub use stage::Calibrator;
 #[doc(hidden)]
 pub use sub_bands::SubBands;

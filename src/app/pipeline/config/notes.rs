@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use super::plan::Plan;
 use super::sections::Config;
 use crate::array::ObservingWindows;
-use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
-use crate::imaging::{Method, RegulariserChoice};
+use crate::calibration::{CORRELATED_MAX, CalibrationHook, GainsFile, VanVleck};
+use crate::imaging::Method;
 use crate::mother::{Fidelity, largest_gap};
 use crate::units::Dimension;
 use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
@@ -45,12 +45,24 @@ impl Config {
         })
     }
 
-    /// A note if gains have known errors that those of the maps leave out.
-    fn gain_errors_note(&self) -> Option<String> {
-        let has_errors = self.map.regulariser() == RegulariserChoice::Data;
-        let leaves_out = has_errors && self.map.method() != Method::Harmonic;
-        (leaves_out && self.calibration.known_error_draws() > 0).then(|| {
-            "errors of the maps leave out those of the gains: only map.engine = \"harmonic\" without map.refine includes them".to_owned()
+    /// A note if errors of gains are asked for, and none will be known.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn gain_errors_note(&self) -> Option<String> {
+        let (calibration, draws) = (&self.calibration, self.calibration.error_draws);
+        let reason = match calibration.hook {
+            CalibrationHook::Solve if self.array.satellites > CORRELATED_MAX => {
+                format!("solutions for more than {CORRELATED_MAX} satellites")
+            }
+            CalibrationHook::AntennaGains if calibration.known_error_draws() == 0 => {
+                "the gains of calibration.gains_file".to_owned()
+            }
+            _ => return None,
+        };
+        (draws > 0).then(|| {
+            format!(
+                "calibration.error_draws = {draws} does nothing: {reason} have no stated errors, and errors of maps leave them out"
+            )
         })
     }
 
@@ -232,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_without_the_errors_of_gains_are_named() {
+    fn gains_without_errors_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let file = |errors: &str| {
             let path = folder.path().join("gains.json");
@@ -242,15 +254,18 @@ mod tests {
             path
         };
         let mut config = Config::default();
-        config.map.engine = EngineKind::Pixel;
         config.calibration.hook = CalibrationHook::AntennaGains;
         config.calibration.gains_file = Some(file(""));
         config.calibration.error_draws = 8;
-        assert_eq!(config.notes(), Vec::<String>::new());
+        assert!(config.notes().join("").contains("gains_file have no stated errors"), "{:?}", config.notes());
         config.calibration.gains_file =
             Some(file(r#", "errors": {"solution_s": 0, "sigma": [[0.1, 0.1], [0.1, 0.1]]}"#));
-        assert!(config.notes().join("").contains("leave out those of the gains"), "{:?}", config.notes());
-        config.map.engine = EngineKind::Harmonic;
+        assert_eq!(config.notes(), Vec::<String>::new());
+        config.calibration.hook = CalibrationHook::Solve;
+        assert_eq!(config.notes(), Vec::<String>::new());
+        config.array.satellites = 17;
+        assert!(config.notes().join("").contains("more than 16 satellites"), "{:?}", config.notes());
+        config.calibration.error_draws = 0;
         assert_eq!(config.notes(), Vec::<String>::new());
     }
 

@@ -341,7 +341,20 @@ impl Config {
         found.extend(self.map.problems());
         found.extend(self.products.problems());
         found.extend(self.runtime.problems());
+        found.extend(self.error_draws_problems());
         found
+    }
+
+    /// Draws of errors of gains for maps that do not use them.
+    fn error_draws_problems(&self) -> Vec<InvalidValue> {
+        let (draws, map) = (self.calibration.error_draws, &self.map);
+        // An engine that is not chosen yet is checked when it is.
+        let is_circle = map.engine == EngineKind::Auto || map.method() == Method::Harmonic;
+        let is_used = is_circle && map.regulariser() == RegulariserChoice::Data;
+        let mut checks = Checks::new("calibration");
+        let expected = "0, as only maps with map.engine = \"harmonic\", R from the data and no map.refine state errors by gains";
+        checks.require("error_draws", draws, draws == 0 || is_used, expected);
+        checks.finish()
     }
 
     /// Hash of the settings that decide the measured data, including the contents of named files, for provenance. `[downlink]` is not
@@ -481,6 +494,20 @@ mod tests {
             assert!(problems(bad.0, bad.1, "samples").is_some_and(|text| text.contains("daughters.bits is")));
         }
         assert!(problems(1, 1, "visibilities").is_some_and(|text| text.contains("expected 0")));
+    }
+
+    #[test]
+    fn draws_for_maps_that_do_not_use_them_are_refused() {
+        let problems = |overrides: &[&str]| {
+            let gains = ["calibration.hook=solve", "calibration.error_draws=8"];
+            let config = with(&[&gains, overrides].concat()).unwrap();
+            config.ground_value_problems().iter().map(ToString::to_string).collect::<String>()
+        };
+        assert!(!problems(&[]).contains("error_draws"));
+        for unused in [["map.engine=pixel"], ["map.regulariser=identity"], ["map.refine.passes_max=3"]] {
+            assert!(problems(&unused).contains("calibration.error_draws = 8"), "{unused:?}");
+            assert!(!problems(&[unused[0], "calibration.error_draws=0"]).contains("error_draws"));
+        }
     }
 
     #[test]

@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::*;
-use crate::calibration::{ChannelGains, GainSolution};
+use crate::calibration::{ChannelGains, GainErrors, GainSolution};
 use crate::units::{ChannelId, StreamKind, random_stream};
 
 const FREQUENCY_HZ: f64 = 10e6;
@@ -233,4 +233,23 @@ fn invalid_values_are_reported_with_their_file() {
     assert!(matches!(error, CalibrationError::Values { .. }), "{error}");
     let text = error.to_string();
     assert!(text.contains("gains.toml") && text.contains("at least one channel"), "{text}");
+}
+
+/// Draws of a channel whose errors are not stated are zero: visibilities carry none.
+#[test]
+fn only_channels_with_stated_errors_have_draws() {
+    let unity = Complex64::new(1.0, 0.0);
+    let mut file = file(Interpolation::LogLinear, vec![(0.0, vec![unity; 3])]);
+    let sigma = vec![[0.1, 0.1]; 3];
+    let errors = GainErrors { solution_s: 0.0, sigma, correlations: Vec::new() };
+    let mut other = file.channels[0].clone();
+    other.frequency_hz = 2.0 * FREQUENCY_HZ;
+    other.solutions[0].errors = Some(errors);
+    file.channels.push(other);
+    let mut gains = AntennaGains::new(&file).unwrap().with_error_draws(&file, 8, 1);
+    for (hz, draws) in [(FREQUENCY_HZ, 0), (2.0 * FREQUENCY_HZ, 8)] {
+        let mut block = PlacedVisibilities { frequency_hz: hz, ..block(vec![1.0, 2.0]) };
+        assert_eq!(gains.apply(&mut block).unwrap().kept, 2);
+        assert_eq!(block.gain_errors.len(), 2 * draws);
+    }
 }

@@ -2,7 +2,7 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use super::config::{AmplitudeScale, SolverConfig};
+use super::config::{AmplitudeScale, CalibrationMode, SolverConfig};
 use super::detect::SignalPresence;
 use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
 use super::fit::Unexplained;
@@ -15,10 +15,7 @@ use crate::numerics::median;
 const COVERAGE_SIGMAS: f64 = 4.0;
 
 /// Maximum number of daughters whose errors are stated with their correlations.
-const CORRELATED_MAX: usize = 16;
-
-/// Square radians in a square degree.
-const RAD2: f64 = (std::f64::consts::PI / 180.0) * (std::f64::consts::PI / 180.0);
+pub const CORRELATED_MAX: usize = 16;
 
 /// Factor by which stated standard deviations exceed the Cramer-Rao bound, as weights are estimates too.
 /// With it fewer than 1e-4 of the errors exceed [`COVERAGE_SIGMAS`] stated deviations: Gaussian errors exceed 4 deviations with
@@ -41,6 +38,13 @@ pub(super) struct GainAssessment<'a> {
 /// Enlarges a standard deviation (rad) so that it covers the non-Gaussian phase error of a weak gain.
 pub(super) fn sigma_with_coverage(sigma: f64) -> f64 {
     (SIGMA_MARGIN * sigma).max((COVERAGE_SIGMAS * sigma).min(1.0).asin() / COVERAGE_SIGMAS)
+}
+
+/// Whether the noise of gains is among the errors of maps. It is not if they are found from the visibilities that are mapped: these are drawn
+/// towards the model, by as much as the noise would draw them away, so that a map of data with noise N and gains of covariance C has that
+/// of `N - T C T'`, T the derivative of the visibilities by the gains.
+pub(super) fn noise_is_in_maps(config: &SolverConfig) -> bool {
+    config.mode == CalibrationMode::Beacon
 }
 
 /// The standard deviation that [`sigma_with_coverage`] enlarges to this one; the largest, if there are several.
@@ -164,6 +168,10 @@ impl GainAssessment<'_> {
         let model = [own_model + self.common_amplitude_variance(c), relative * (own_model + reference_model)];
         let noise = noise.map(sigma_with_coverage);
         let total = |axis: usize| (noise[axis].powi(2) + scatter[axis] + model[axis]).sqrt();
+        // The strength of the model is that of the map, too.
+        let in_maps = if noise_is_in_maps(self.config) { noise.map(|sigma| sigma * sigma) } else { [0.0; 2] };
+        let map_sigma =
+            [in_maps[0] + scatter[0] + own_model, relative * (in_maps[1] + scatter[1]) + model[1]];
         let [visibilities, outliers] = self.counts.by_gain[k];
         GainEstimate {
             frequency_hz: layout.frequencies_hz[c],
@@ -178,6 +186,7 @@ impl GainAssessment<'_> {
             outliers,
             data_s: self.counts.data_s[k],
             noise_sigma: [noise[0], relative * noise[1]],
+            map_sigma: map_sigma.map(f64::sqrt),
             state: self.state(
                 (c, n),
                 gain.norm(),
@@ -186,15 +195,10 @@ impl GainAssessment<'_> {
         }
     }
 
-    /// Correlations of the errors of the gains of a channel: of ln amplitude and of phase, of each daughter with those before it. Noise correlates
-    /// them as the solution says; all share the errors of the common amplitude (`common`, a variance) and of the reference's phase. None for more
-    /// than [`CORRELATED_MAX`] daughters, as files and states would grow with the square of their number.
-    pub(super) fn correlations(
-        &self,
-        c: usize,
-        common: f64,
-        estimates: &[DaughterEstimate],
-    ) -> Vec<[f64; 2]> {
+    /// Correlations of the errors of maps by the gains of a channel: of ln amplitude and of phase, of each daughter with those before it. Noise
+    /// correlates them as the solution says; all share the error of the reference's phase. None for more than [`CORRELATED_MAX`] daughters, as
+    /// files and states would grow with the square of their number.
+    pub(super) fn correlations(&self, c: usize, estimates: &[DaughterEstimate]) -> Vec<[f64; 2]> {
         let layout = &self.fitted.layout;
         if layout.satellites > CORRELATED_MAX {
             return Vec::new();
@@ -205,7 +209,8 @@ impl GainAssessment<'_> {
             reference.scatter[1] + reference.hidden + self.model_variance(of(layout.reference));
         let correlation = |i: usize, j: usize| {
             let [a, b] = [i, j].map(|n| &estimates[n].gains[c]);
-            let is_joint = ![i, j].iter().any(|n| self.fitted.dropped_gains[of(*n)]);
+            let is_joint =
+                noise_is_in_maps(self.config) && ![i, j].iter().any(|n| self.fitted.dropped_gains[of(*n)]);
             let is_relative = ![i, j].contains(&layout.reference);
             let noise = [0, 1].map(|axis| {
                 let covariance = |i, j| self.gain_covariance(axis, c, (i, j));
@@ -216,11 +221,9 @@ impl GainAssessment<'_> {
                     0.0
                 }
             });
-            let shared = [common, if is_relative { of_reference } else { 0.0 }];
-            let sigma =
-                [a.amplitude_sigma * b.amplitude_sigma, (a.phase_sigma_deg * b.phase_sigma_deg) * RAD2];
+            let shared = [0.0, if is_relative { of_reference } else { 0.0 }];
             [0, 1].map(|axis| {
-                let found = (noise[axis] + shared[axis]) / sigma[axis];
+                let found = (noise[axis] + shared[axis]) / (a.map_sigma[axis] * b.map_sigma[axis]);
                 if found.is_finite() { found.clamp(-1.0, 1.0) } else { 0.0 }
             })
         };

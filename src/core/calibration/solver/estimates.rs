@@ -75,6 +75,9 @@ pub struct GainEstimate {
     /// Standard deviations by noise alone, of the amplitude's logarithm and of the phase (rad).
     #[serde(skip)]
     pub noise_sigma: [f64; 2],
+    /// Standard deviations of the errors, of the same, that a map has by this gain.
+    #[serde(skip)]
+    pub map_sigma: [f64; 2],
     /// Quality state.
     pub state: GainState,
 }

@@ -68,6 +68,7 @@ mod table;
 mod tests;
 mod verdict;
 
+pub use assessment::CORRELATED_MAX;
 pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};

@@ -12,6 +12,7 @@ use super::*;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{StreamKind, all_pairs, random_stream};
 
+mod correlation_tests;
 mod event_tests;
 mod fault_tests;
 mod kind_tests;

@@ -8,7 +8,7 @@
 
 use std::f64::consts::{PI, TAU};
 
-use super::assessment::{SIGMA_MARGIN, bare_sigma, sigma_with_coverage};
+use super::assessment::{SIGMA_MARGIN, bare_sigma, noise_is_in_maps, sigma_with_coverage};
 use super::config::{AmplitudeScale, SolverConfig};
 use super::estimates::{GainEstimate, GainState};
 use super::solution::PassSolution;
@@ -24,11 +24,13 @@ struct Measured {
     variance: f64,
 }
 
+/// Whether a solution of a pass is smoothed with the one before.
+pub(super) fn goes_on(before: &PassSolution, after: &PassSolution) -> bool {
+    before.pass == after.pass && !after.begins_with_jump && before.reference == after.reference
+}
+
 /// Replaces good gains of the solutions of a pass, in the order of time, by those of the random walk that all of them tell; not across jumps.
 pub(super) fn smooth(solutions: &mut [PassSolution], config: &SolverConfig) {
-    let goes_on = |before: &PassSolution, after: &PassSolution| {
-        !after.begins_with_jump && before.reference == after.reference
-    };
     for run in solutions.chunk_by_mut(goes_on).filter(|run| run.len() > 1) {
         let daughters = run.iter().map(|one| one.daughters.len()).min().unwrap_or(0);
         for n in 0..daughters {
@@ -37,7 +39,8 @@ pub(super) fn smooth(solutions: &mut [PassSolution], config: &SolverConfig) {
                 let gains = run.iter_mut().map(|one| &mut one.daughters[n].gains[c]);
                 let good: Vec<&mut GainEstimate> =
                     gains.filter(|gain| gain.state == GainState::Good).collect();
-                smooth_gain(good, |frequency_hz| priors(config, daughters, frequency_hz));
+                let priors = |frequency_hz| priors(config, daughters, frequency_hz);
+                smooth_gain(good, noise_is_in_maps(config), priors);
             }
         }
     }
@@ -55,7 +58,7 @@ fn priors(config: &SolverConfig, daughters: usize, frequency_hz: f64) -> [f64; 2
     [free * config.amplitude_sigma.powi(2), phase * phase + clock * clock].map(f64::recip)
 }
 
-fn smooth_gain(mut good: Vec<&mut GainEstimate>, priors: impl Fn(f64) -> [f64; 2]) {
+fn smooth_gain(mut good: Vec<&mut GainEstimate>, is_in_maps: bool, priors: impl Fn(f64) -> [f64; 2]) {
     let Some(priors) = good.first().map(|gain| priors(gain.frequency_hz)) else { return };
     for (part, prior) in priors.into_iter().enumerate() {
         let of_data = good.iter().enumerate().filter_map(|(k, gain)| Some((k, measured(gain, part, prior)?)));
@@ -67,7 +70,8 @@ fn smooth_gain(mut good: Vec<&mut GainEstimate>, priors: impl Fn(f64) -> [f64; 2
             let information = SIGMA_MARGIN.powi(2) / variance;
             let known = information + prior;
             let value = if part == 1 { (value + PI).rem_euclid(TAU) - PI } else { value };
-            replace(good[k], part, [value * information / known, SIGMA_MARGIN / known.sqrt()]);
+            let found = [value * information / known, SIGMA_MARGIN / known.sqrt()];
+            replace(good[k], part, found, is_in_maps);
         }
     }
 }
@@ -87,9 +91,12 @@ fn measured(gain: &GainEstimate, part: usize, prior: f64) -> Option<Measured> {
 }
 
 /// Sets the amplitude's logarithm or the phase, and its standard deviation by noise.
-fn replace(gain: &mut GainEstimate, part: usize, [value, sigma]: [f64; 2]) {
+fn replace(gain: &mut GainEstimate, part: usize, [value, sigma]: [f64; 2], is_in_maps: bool) {
     let noise = std::mem::replace(&mut gain.noise_sigma[part], sigma);
     let total = |before: f64| (sigma * sigma + (before * before - noise * noise).max(0.0)).sqrt();
+    if is_in_maps {
+        gain.map_sigma[part] = total(gain.map_sigma[part]);
+    }
     if part == 0 {
         (gain.amplitude, gain.amplitude_sigma) = (value.exp(), total(gain.amplitude_sigma));
     } else {
@@ -171,7 +178,9 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
-    use crate::calibration::solver::ModelVerdict;
+    use crate::calibration::GainSolution;
+    use crate::calibration::solver::{ModelVerdict, gains_file};
+    use crate::frames::Channel;
     use crate::units::{StreamKind, random_stream};
 
     /// The smoother given q is the solution of the normal equations of all values, which are written out here.
@@ -231,6 +240,7 @@ mod tests {
             outliers: 0,
             data_s: [time_s, time_s + 100.0],
             noise_sigma,
+            map_sigma: noise_sigma,
             state: GainState::Good,
         }
     }
@@ -305,6 +315,25 @@ mod tests {
         }
         // Less than one in ten thousand of 8000, as of every gain.
         assert_eq!(beyond, 0);
+    }
+
+    /// Each part tells of the others: draws of their errors are the same, as those of the entries of one solution.
+    #[test]
+    fn parts_that_were_smoothed_have_one_error() {
+        let part = |k: u32| vec![good(300.0 * f64::from(k), [0.0; 2], [0.1; 2]); 2];
+        let mut all = solutions((0..5).map(part).collect());
+        all[2].begins_with_jump = true;
+        all.iter_mut().for_each(|one| one.correlations = vec![vec![[0.0; 2]]]);
+        let file = gains_file(&all, &[Channel { frequency_hz: 3e6, width_hz: 8e3 }], false);
+        let entries = &file.channels[0].solutions;
+        let (before, after): (Vec<&GainSolution>, Vec<_>) =
+            entries.iter().partition(|one| one.time_s < 550.0);
+        let name = |one: &GainSolution| one.errors.as_ref().map(|errors| errors.solution_s);
+        assert!(before.len() > 2 && after.len() > 3);
+        for entries in [&before, &after] {
+            assert!(name(entries[0]).is_some() && entries.iter().all(|one| name(one) == name(entries[0])));
+        }
+        assert_ne!(name(before[0]), name(after[0]));
     }
 
     /// Phases about half a turn, a jump, a part without signal, and the reference.

@@ -54,7 +54,7 @@ pub struct PassSolution {
     /// Normal of each daughter's orbit, on ecliptic axes.
     #[serde(skip)]
     pub normal_hat: Vec<Vec3>,
-    /// Correlations of the errors of gains, by channel: of ln amplitude and of phase, of daughter 2 with 1, 3 with 1, 3 with 2, and so on.
+    /// Correlations of the errors of maps by gains, by channel: of ln amplitude and of phase, of daughter 2 with 1, 3 with 1, 3 with 2, and so on.
     #[serde(skip)]
     pub correlations: Vec<Vec<[f64; 2]>>,
 }
@@ -262,9 +262,8 @@ impl CheckedFit {
             && is_contradicted(layout, newton, &fitted.used_sums());
         let assessment = GainAssessment { config, fitted, counts, unexplained, excess };
         let mut daughters = assessment.estimates();
-        let (models, common) = self.models(config, &mut daughters, &assessment);
-        let correlations =
-            (0..).zip(&common).map(|(c, common)| assessment.correlations(c, *common, &daughters)).collect();
+        let models = self.models(config, &mut daughters, &assessment);
+        let correlations = (0..model_error.len()).map(|c| assessment.correlations(c, &daughters)).collect();
         let mut solution = PassSolution {
             pass,
             from_s: interval.span_s[0],
@@ -290,14 +289,13 @@ impl CheckedFit {
         solution
     }
 
-    /// Verdicts on the models of all channels, and variances of the amplitudes' common error. A factor that amplitudes have in common is added to
-    /// their errors.
+    /// Verdicts on the models of all channels. A factor that amplitudes have in common is added to their errors.
     fn models(
         &self,
         config: &SolverConfig,
         daughters: &mut [DaughterEstimate],
         assessment: &GainAssessment<'_>,
-    ) -> (Vec<ModelVerdict>, Vec<f64>) {
+    ) -> Vec<ModelVerdict> {
         let channels = self.model_error.len();
         let uncertainty: Vec<f64> =
             (0..channels).map(|c| assessment.common_amplitude_variance(c).sqrt()).collect();
@@ -324,8 +322,6 @@ impl CheckedFit {
             weak.filter(|(gain, _)| gain.state == GainState::Good)
                 .for_each(|(gain, _)| gain.state = GainState::PoorFit);
         }
-        let variance =
-            |(of_model, factor): (&f64, &Option<f64>)| of_model.powi(2) + factor.unwrap_or(0.0).powi(2);
-        (verdicts, uncertainty.iter().zip(&common).map(variance).collect())
+        verdicts
     }
 }

@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use super::estimates::{DaughterEstimate, GainEstimate, GainState};
+use super::smooth::goes_on;
 use super::solution::PassSolution;
 use crate::calibration::gains_file::SIGMA_MAX;
 use crate::calibration::{
@@ -60,23 +61,24 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     text
 }
 
-/// Errors of the gains of a solution in a channel, rounded to 1e-6; `None` if their correlations are not known.
+/// Errors of maps by the gains of a solution in a channel, rounded to 1e-6; `None` if there are none, or their correlations are not known.
+/// `solution_s` names all solutions that were smoothed together: each tells of all.
 fn errors_of(
     solution: &PassSolution,
-    c: usize,
+    (solution_s, c): (f64, usize),
     is_used: impl Fn(&GainEstimate) -> bool,
 ) -> Option<GainErrors> {
     let rounded = |values: [f64; 2]| values.map(|value| (value * 1e6).round() / 1e6);
     let correlations = solution.correlations.get(c).filter(|found| !found.is_empty())?;
     let sigma = |daughter: &DaughterEstimate| {
         let gain = &daughter.gains[c];
-        let stated = [gain.amplitude_sigma, gain.phase_sigma_deg.to_radians()];
         // `min` takes the bound for what is not a number.
-        if is_used(gain) { rounded(stated.map(|sigma| sigma.min(SIGMA_MAX))) } else { [0.0; 2] }
+        if is_used(gain) { rounded(gain.map_sigma.map(|sigma| sigma.min(SIGMA_MAX))) } else { [0.0; 2] }
     };
-    Some(GainErrors {
-        solution_s: 0.5 * (solution.from_s + solution.until_s),
-        sigma: solution.daughters.iter().map(sigma).collect(),
+    let sigma: Vec<[f64; 2]> = solution.daughters.iter().map(sigma).collect();
+    sigma.as_flattened().iter().any(|sigma| *sigma > 0.0).then(|| GainErrors {
+        solution_s,
+        sigma,
         correlations: correlations.iter().map(|pair| rounded(*pair)).collect(),
     })
 }
@@ -104,26 +106,31 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
     };
     let channel = |(c, channel): (usize, &Channel)| {
         let mut found: Vec<GainSolution> = Vec::new();
-        let mut push = |time_s: f64, solution: &PassSolution| {
+        let mut push = |time_s: f64, (run_s, solution): (f64, &PassSolution)| {
             // Times must increase: of two equal ones the first is used.
             if found.last().is_none_or(|last| last.time_s < time_s) {
-                let errors = errors_of(solution, c, |gain| is_used(solution, gain));
+                let errors = errors_of(solution, (run_s, c), |gain| is_used(solution, gain));
                 found.push(GainSolution { time_s, gains: gains(c, solution), errors });
             }
         };
+        let mut run_s = 0.0;
         for (k, solution) in solutions.iter().enumerate() {
+            if k == 0 || !goes_on(&solutions[k - 1], solution) {
+                run_s = 0.5 * (solution.from_s + solution.until_s);
+            }
+            let of_run = (run_s, solution);
             let is_first = k == 0 || solutions[k - 1].pass != solution.pass || solution.begins_with_jump;
             let is_last =
                 solutions.get(k + 1).is_none_or(|next| next.pass != solution.pass || next.begins_with_jump);
             if is_first {
                 // Times must increase: the part before ends where this one begins.
-                push(solution.from_s + if solution.begins_with_jump { JUMP_S } else { 0.0 }, solution);
+                push(solution.from_s + if solution.begins_with_jump { JUMP_S } else { 0.0 }, of_run);
             }
             if !(is_first && is_last) {
-                push(0.5 * (solution.from_s + solution.until_s), solution);
+                push(0.5 * (solution.from_s + solution.until_s), of_run);
             }
             if is_last {
-                push(solution.until_s, solution);
+                push(solution.until_s, of_run);
             }
         }
         ChannelGains { frequency_hz: channel.frequency_hz, solutions: found }

@@ -28,7 +28,7 @@ pub(in crate::ground) struct JournalRecord {
     pub(in crate::ground) counts: PacketOutcome,
     /// Whether its block had been received already, in another packet.
     pub(in crate::ground) is_duplicate: bool,
-    /// Digest of the positions, values and weights offered to the sums.
+    /// Digest of the positions, values, weights and draws offered to the sums.
     pub(in crate::ground) digest: u32,
     /// Number of visibilities with positions, which were offered to the sums.
     pub(in crate::ground) offered: u32,

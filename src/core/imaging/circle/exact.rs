@@ -103,15 +103,19 @@ impl ExactTori {
         self.error_power as f64 / ERROR_POWER_STEPS
     }
 
+    /// Number of pairs of draws of the errors by gains.
+    fn error_pairs(&self) -> usize {
+        self.nodes.iter().flatten().map(ExactNode::error_pairs).max().unwrap_or(0)
+    }
+
     /// Pairs of right-hand sides of draws of the errors by gains, in f32.
     pub(super) fn gain_errors(&self, grids: &Grids, quanta: Quanta) -> Vec<Tori> {
-        let pairs = self.nodes.iter().flatten().map(ExactNode::error_pairs).max().unwrap_or(0);
         let of_pair = |pair: usize| {
             let right = |node: &ExactNode| Some(right_values(node.gain_errors.get(pair)?, grids, quanta));
             let of_node = |node: &Option<ExactNode>| node.as_ref().and_then(right).map(NodeSums::of_right);
             Tori::in_memory(self.nodes.par_iter().map(of_node).collect())
         };
-        (0..pairs).map(of_pair).collect()
+        (0..self.error_pairs()).map(of_pair).collect()
     }
 
     /// Converts the sums to f32.
@@ -120,9 +124,23 @@ impl ExactTori {
         Tori::in_memory(self.nodes.par_iter().map(|node| node.as_ref().and_then(value)).collect())
     }
 
-    /// Converts the sums to f32, and frees the integers node by node.
-    pub(super) fn into_values(self, grids: &Grids, quanta: Quanta) -> Tori {
-        let value = |node: ExactNode| (!node.is_empty()).then(|| node.values(grids, quanta));
-        Tori::in_memory(self.nodes.into_par_iter().map(|node| node.and_then(value)).collect())
+    /// Converts the sums, and the pairs of draws, to f32, and frees the integers node by node.
+    pub(super) fn into_values(self, grids: &Grids, quanta: Quanta) -> (Tori, Vec<Tori>) {
+        let mut pairs = vec![Vec::with_capacity(self.nodes.len()); self.error_pairs()];
+        let value = |node: ExactNode| {
+            let draws = node.gain_errors.iter();
+            let draws: Vec<NodeSums> =
+                draws.map(|rows| NodeSums::of_right(right_values(rows, grids, quanta))).collect();
+            (!node.is_empty()).then(|| (node.values(grids, quanta), draws))
+        };
+        let values: Vec<_> = self.nodes.into_par_iter().map(|node| node.and_then(value)).collect();
+        let of_node = |found: Option<(NodeSums, Vec<NodeSums>)>| {
+            let (values, draws) = found.unzip();
+            let mut draws = draws.unwrap_or_default().into_iter();
+            pairs.iter_mut().for_each(|pair| pair.push(draws.next()));
+            values
+        };
+        let values = values.into_iter().map(of_node).collect();
+        (Tori::in_memory(values), pairs.into_iter().map(Tori::in_memory).collect())
     }
 }

@@ -230,9 +230,9 @@ impl SkyBasis for HarmonicBasis {
     }
 
     fn finish(&self, exact: ExactTori, counts: SumCounts) -> HarmonicSums {
-        let (gain_errors, gain_error_power) =
-            (exact.gain_errors(&self.grids, self.quanta), exact.error_power());
-        let sums = self.sums(exact.into_values(&self.grids, self.quanta), gain_errors, counts);
+        let gain_error_power = exact.error_power();
+        let (values, gain_errors) = exact.into_values(&self.grids, self.quanta);
+        let sums = self.sums(values, gain_errors, counts);
         HarmonicSums { gain_error_power, ..sums }
     }
 

@@ -18,7 +18,7 @@ use super::{HarmonicBasis, HarmonicEngine};
 use crate::files::write_at;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::solver::add;
-use crate::imaging::{AccumulationError, SumCounts};
+use crate::imaging::{AccumulationError, NormalSums, SumCounts};
 use crate::ranks::{RankShare, Ranks};
 
 impl StoredTori {
@@ -168,6 +168,9 @@ impl HarmonicSums {
     pub(in crate::imaging) fn on_disk(mut self, folder: &Path) -> Result<Self, AccumulationError> {
         if self.tori.stored.is_none() && !self.ranks.is_distributed() {
             let store_error = |source| AccumulationError::Store { folder: folder.to_owned(), source };
+            // What remains of the draws in memory are their right-hand sides.
+            self.gain_error_right_hand_sides();
+            self.gain_error_tori = Vec::new();
             let stored = StoredTori::of_memory(&self.grids, &self.tori, folder).map_err(store_error)?;
             self.tori = Tori::on_disk(stored);
         }

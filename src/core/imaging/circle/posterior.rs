@@ -83,7 +83,7 @@ impl Posterior<'_> {
         let [mean_sigma_k, dipole_sigma_k @ ..] = moments_sigma_k;
         let [_, dipole_k @ ..] = moments_k(self.whole, self.l_max());
         let mut samples = if samples.gibbs {
-            self.gibbs_samples(samples.count)?
+            self.gibbs_samples(samples.count, &scale)?
         } else {
             self.samples(samples.count, &factors, products, &scale)?
         };
@@ -198,7 +198,7 @@ impl Posterior<'_> {
     }
 
     /// The same of maps and powers as likely as those that were found.
-    fn gibbs_samples(&self, count: usize) -> Result<Vec<Vec<f64>>, SolveError> {
+    fn gibbs_samples(&self, count: usize, scale: &[f64]) -> Result<Vec<Vec<f64>>, SolveError> {
         let mut samples = Vec::new();
         for number in 0..count as u64 {
             if !self.watch.may_continue() {
@@ -208,15 +208,15 @@ impl Posterior<'_> {
             let name = format!("sample {} of {count}, with its power", number + 1);
             let drawn = self.found.gibbs(number, &mut |r| {
                 turn += 1;
-                self.drawn_with(r, GIBBS + 16 * number + turn, &name)
+                self.drawn_with((r, scale), GIBBS + 16 * number + turn, &name)
             });
             samples.push(drawn.iter().zip(self.solved).map(|(drawn, solved)| drawn - solved).collect());
         }
         Ok(samples)
     }
 
-    /// Coefficients, less those of the prior, as likely as the data say with this R.
-    fn drawn_with(&self, r: &[f64], which: u64, name: &str) -> Vec<f64> {
+    /// Coefficients, less those of the prior, as likely as the data say with this R, for data of this noise by degree.
+    fn drawn_with(&self, (r, scale): (&[f64], &[f64]), which: u64, name: &str) -> Vec<f64> {
         let factors = &Factors::new(self.blocks, r);
         let regularisation = Diagonal::ByDegree(r.to_vec());
         let products = |x: &[&[f64]]| self.sums.apply_all(x);
@@ -233,7 +233,8 @@ impl Posterior<'_> {
             PosteriorPrecision { products: &products, unknowns, regularisation: &regularisation, factors };
         let task = self.watch.start(name, SAMPLE_TOLERANCE);
         for PosteriorSample { exact, .. } in covariance.draw(&[which], SAMPLE_TOLERANCE, &task) {
-            sky.iter_mut().zip(exact).for_each(|(sky, drawn)| *sky += self.found.noise_factor() * drawn);
+            let drawn = degrees(self.l_max()).zip(exact);
+            sky.iter_mut().zip(drawn).for_each(|(sky, (l, drawn))| *sky += scale[l] * drawn);
         }
         sky
     }
