@@ -166,8 +166,11 @@ fn the_second_signal_ends_it_at_once() {
     let mut feed = File::options().write(true).open(&pipe).unwrap();
     feed.write_all(&std::fs::read(&file).unwrap()[..10_000]).unwrap();
     let mut said = progress(&mut child);
+    // `timeout` signals its child and then the group: one request.
+    signal(&child, "INT");
     signal(&child, "INT");
     assert!(said.any(|line| line.contains("interrupt again to stop immediately")));
+    std::thread::sleep(Duration::from_millis(500));
     assert!(child.try_wait().unwrap().is_none(), "the first signal ended it, with time left");
     signal(&child, "TERM");
     let (status, took) = end(&mut child);

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 
 use super::common::process::{end, hidden, output, signal, start, wait_until};
-use super::common::workplace::{SMALL, Workplace, fail, files, succeed};
+use super::common::workplace::{SMALL, Workplace, fail, files, lunarray, succeed};
 
 #[test]
 fn of_two_simulations_to_one_file_one_is_refused() {
@@ -51,7 +51,27 @@ fn a_folder_of_products_has_one_writer() {
     ] {
         let said = fail(args);
         assert!(said.contains(&out) && said.contains("in use by another process"), "{said}");
+        assert_eq!(said.matches("expected").count(), 1, "{said}");
     }
+    // No new state is left behind where there can be no products, nor where nothing can be heard.
+    let state = place.path("state");
+    let with_state = ["replay", "--map", &place.pipeline, "--state", &state, "--out"];
+    assert!(fail(&[&with_state[..], &[&out, &file]].concat()).contains("in use"));
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("tcp://{}", taken.local_addr().unwrap());
+    let other = place.path("other");
+    assert!(fail(&[&with_state[..], &[&other, "--listen", &url]].concat()).contains("cannot listen"));
+    assert!(!Path::new(&state).exists() && !Path::new(&other).exists());
+    // What is no folder is said to be none, and is a configuration that cannot be used.
+    let link = place.path("link");
+    std::os::unix::fs::symlink(place.path("nothing"), &link).unwrap();
+    let plain = place.file("plain", b"");
+    for (name, what) in [(&plain, "not a folder"), (&link, "a link to nothing")] {
+        let refused = lunarray(&[&with_state[..], &[name, &file]].concat());
+        let said = String::from_utf8(refused.stderr).unwrap();
+        assert!(refused.status.code() == Some(2) && said.contains(what) && said.contains(name), "{said}");
+    }
+    assert!(!Path::new(&state).exists());
     drop(feed);
     assert!(end(&mut first).0.success());
     // As if nothing had been.

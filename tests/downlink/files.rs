@@ -315,6 +315,86 @@ fn a_file_that_lacks_visibilities_is_not_sound() {
 }
 
 #[test]
+fn a_file_in_any_order_is_as_sound_as_in_the_order_of_sending() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    // The positions are in segments.
+    let config = DownlinkConfig { packet_bytes_max: 2_000, ..DownlinkConfig::default() };
+    let mut writer = DownlinkWriter::create(&path, &config).unwrap();
+    frames().iter().for_each(|frame| writer.write(frame).unwrap());
+    writer.finish().unwrap();
+    let bytes = fs::read(&path).unwrap();
+    let sent = packets(&bytes);
+    let is_segment = |packet: &&[u8]| packet[2] >> 6 != 3;
+    assert!(sent.iter().any(is_segment));
+    // Of every kind: the order, not the packets, says how many are late.
+    let contents_of = |packets: &[&[u8]]| {
+        fs::write(&path, packets.concat()).unwrap();
+        let contents = Contents::read(&path).unwrap();
+        let mut value = serde_json::to_value(&contents).unwrap();
+        for kind in ["instrument", "ephemeris", "visibilities", "housekeeping"] {
+            value["reception"][kind]["late"] = 0.into();
+        }
+        (contents, value)
+    };
+    let (whole, in_order) = contents_of(&sent);
+    assert!(whole.is_sound(), "{whole}");
+    let orders: [Vec<usize>; 3] = [
+        (0..sent.len()).rev().collect(),
+        (0..sent.len() / 2).flat_map(|k| [2 * k + 1, 2 * k]).chain(sent.len() / 2 * 2..sent.len()).collect(),
+        (sent.len() / 3..sent.len()).chain(0..sent.len() / 3).collect(),
+    ];
+    for order in &orders {
+        let turned: Vec<&[u8]> = order.iter().map(|k| sent[*k]).collect();
+        let (contents, value) = contents_of(&turned);
+        assert!(contents.is_sound() && contents.to_string().contains("\nsound: "), "{contents}");
+        assert_eq!(value, in_order);
+        // Two neighbours lost, of visibilities: one gap, before the packet that follows them in the order of sending.
+        let of_visibilities: Vec<usize> =
+            (0..sent.len()).filter(|k| PacketHeader::parse(sent[*k]).unwrap().kind.apid() == 0x103).collect();
+        let [lost, also_lost, next] = [2, 3, 4].map(|k| of_visibilities[k]);
+        let rest: Vec<usize> = order.iter().copied().filter(|k| ![lost, also_lost].contains(k)).collect();
+        let (contents, _) = contents_of(&rest.iter().map(|k| sent[*k]).collect::<Vec<_>>());
+        assert_eq!(contents.gaps.count, 1, "{contents}");
+        let count = |k: usize| PacketHeader::parse(sent[k]).unwrap().count;
+        let offset: usize = rest.iter().take_while(|k| **k != next).map(|k| sent[*k].len()).sum();
+        let gap = &contents.gaps.listed[0];
+        assert_eq!((gap.from, gap.to, gap.offset), (count(lost), count(also_lost), offset as u64));
+        assert_eq!(contents.reception.visibilities.missing, 2);
+        assert!(contents.to_string().contains("\nnot sound: "), "{contents}");
+    }
+}
+
+#[test]
+fn there_is_always_a_verdict() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    write(&path);
+    let bytes = fs::read(&path).unwrap();
+    let sent = packets(&bytes);
+    let without = |is_lost: &dyn Fn(usize, &PacketHeader) -> bool| {
+        let kept =
+            sent.iter().enumerate().filter(|(k, packet)| !is_lost(*k, &PacketHeader::parse(packet).unwrap()));
+        fs::write(&path, kept.flat_map(|(_, packet)| packet.to_vec()).collect::<Vec<u8>>()).unwrap();
+        Contents::read(&path).unwrap().to_string()
+    };
+    // All visibilities are there, but not all positions; no description; no counts.
+    let ephemeris: Vec<usize> =
+        (0..sent.len()).filter(|k| PacketHeader::parse(sent[*k]).unwrap().kind.apid() == 0x102).collect();
+    let second = ephemeris[1];
+    let lacks_positions = without(&|k, _| k == second);
+    assert!(
+        lacks_positions.contains("\nnot sound: ") && lacks_positions.contains("gaps: 1"),
+        "{lacks_positions}"
+    );
+    let lacks_description = without(&|_, header| header.kind.apid() == 0x101);
+    assert!(lacks_description.contains("\nnot sound: "), "{lacks_description}");
+    assert!(lacks_description.contains("no instrument description came"), "{lacks_description}");
+    let lacks_counts = without(&|_, header| header.kind.apid() == 0x105);
+    assert!(lacks_counts.contains("\nnot known to be sound: "), "{lacks_counts}");
+}
+
+#[test]
 fn frames_of_another_kind_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("pass.cadu");

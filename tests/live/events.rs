@@ -1,7 +1,7 @@
 //! `--events`: a run told line by line.
 
 use super::common::process::{output, start};
-use super::common::workplace::{lunarray, maps};
+use super::common::workplace::maps;
 use super::serving::SNAPSHOTS;
 use super::*;
 

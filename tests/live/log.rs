@@ -49,7 +49,10 @@ fn every_line_of_a_ground_that_listens_is_an_object() {
     let mut reader = BufReader::new(child.stderr.take().unwrap());
     let mut first = String::new();
     reader.read_line(&mut first).unwrap();
-    let url = lines(&first)[0]["url"].as_str().unwrap().to_owned();
+    assert_eq!([&lines(&first)[0]["event"], &lines(&first)[0]["segment"]], ["begin", "ground"]);
+    let mut second = String::new();
+    reader.read_line(&mut second).unwrap();
+    let url = lines(&second)[0]["url"].as_str().unwrap().to_owned();
     let send = |bytes: &[u8]| finish(TcpStream::connect(url.strip_prefix("tcp://").unwrap()).unwrap(), bytes);
     // A regular end, and one that should be looked at.
     assert_eq!(send(&bytes), format!("taken {} bytes\n", bytes.len()));
@@ -57,7 +60,7 @@ fn every_line_of_a_ground_that_listens_is_an_object() {
     let mut rest = String::new();
     reader.read_to_string(&mut rest).unwrap();
     assert!(process::output(child).status.success(), "{rest}");
-    let told = lines(&(first + &rest));
+    let told = lines(&(first + &second + &rest));
     let of = |event: &str| told.iter().filter(|line| line["event"] == event).collect::<Vec<_>>();
     let senders = of("sender");
     assert_eq!([&senders[0]["ended"], &senders[1]["ended"]], ["whole", "no-state"]);
@@ -69,6 +72,8 @@ fn every_line_of_a_ground_that_listens_is_an_object() {
     assert!(progress[0]["elapsed_s"].as_f64().unwrap() >= 10.0);
     assert_eq!(progress[0]["stages"][0]["name"], "read");
     assert!(progress[0]["ledger"].is_object() && progress[0]["reception"].is_object());
+    assert_eq!(of("end").len(), 1);
+    assert_eq!(of("end")[0]["status"], "complete");
 }
 
 #[test]
@@ -93,20 +98,20 @@ fn notes_errors_and_wrong_usage_are_objects_too() {
     assert_eq!(code, 0, "{text}");
     // Notes on the configuration come first.
     assert_eq!(told.iter().find(|line| line["event"] != "note").unwrap()["event"], "serving");
+    let expected = ["serving", "begin", "note", "incomplete", "progress", "map", "stage-ended", "end"];
     // Without the last report nobody knows what else is missing, or with it all is known: then nothing is said.
-    assert!(
-        events(&told)
-            .iter()
-            .all(|event| ["serving", "note", "incomplete", "progress", "map", "stage-ended"].contains(event)),
-        "{text}"
-    );
+    assert!(events(&told).iter().all(|event| expected.contains(event)), "{text}");
+    // However short the run.
+    for event in ["begin", "progress", "end"] {
+        assert!(events(&told).contains(&event), "{event}: {text}");
+    }
     // An error with its causes; the option may stand anywhere.
     let missing = place.path("missing.ccsds");
     let (code, text) = said(&["replay", &missing, "--out", &out, "--log=json"]);
     let told = lines(&text);
-    assert_eq!((code, events(&told)), (1, vec!["error"]), "{text}");
-    assert!(told[0]["message"].as_str().unwrap().contains("missing.ccsds") && told[0]["causes"].is_array());
-    assert_eq!(told[0]["level"], "error");
+    assert_eq!((code, events(&told)), (1, vec!["begin", "end", "error"]), "{text}");
+    assert!(told[2]["message"].as_str().unwrap().contains("missing.ccsds") && told[2]["causes"].is_array());
+    assert_eq!([&told[1]["status"], &told[2]["level"]], ["failed", "error"]);
     // Wrong usage, of which the command line itself is to blame.
     let (code, text) = said(&["replay", "--log", "json", "--no-such-option"]);
     assert_eq!((code, events(&lines(&text))), (2, vec!["usage"]), "{text}");

@@ -36,7 +36,7 @@ use std::time::{Duration, Instant};
 
 use common::downlink::{mission, packets_of, pass_ends, transmit};
 use common::schema::check_summary;
-use common::workplace::{SMALL, Workplace, fail, succeed};
+use common::workplace::{SMALL, Workplace, fail, lunarray, succeed};
 use lunarray::downlink::transport::socket::{ListenConfig, ListenLimits, SocketSource};
 use lunarray::downlink::{
     CucTime, DownlinkConfig, FORMAT_VERSION, PACKET_BYTES_MAX, PacketHeader, PacketKind, PacketSegment,

@@ -275,7 +275,9 @@ fn nothing_is_told_of_what_is_not_known() {
     assert!(served.end().success());
     // A channel that is not there.
     let served = finished(&place, "out");
-    assert!(served.json("/api/uvw/2").is_null());
+    for of in ["uvw", "hits", "powers"] {
+        assert_eq!(served.get(&format!("/api/{of}/2")).status, 404, "{of}");
+    }
     assert!(!served.json("/api/uvw/1").is_null());
 }
 

@@ -315,6 +315,7 @@ fn every_route_answers_and_nothing_else_does() {
     for method in ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "BREW"] {
         let reply = served.request(method, "/api/status", &served.address);
         assert_eq!((reply.status, reply.header("allow")), (405, "GET, HEAD"), "{method}");
+        assert!(reply.text().contains("expected GET or HEAD"), "{}", reply.text());
     }
     only_its_own_names_are_answered(&served);
     assert_eq!(served.get("/healthz").status, 200);

@@ -69,7 +69,10 @@ fn a_spacecraft_without_the_token_is_told_so_at_once() {
     assert!(complaint(&[&sends[..], &["--token", &stations]].concat()).contains("2 stations"));
     let out = place.path("out");
     let listens = ["replay", "--listen", "tcp://127.0.0.1:0", "--out", &out, "--stations", &wrong];
-    assert!(complaint(&listens).contains("chmod 600"));
+    let refused = lunarray(&listens);
+    assert!(
+        refused.status.code() == Some(2) && String::from_utf8_lossy(&refused.stderr).contains("chmod 600")
+    );
     let mut ground = ground;
     ground.child.kill().unwrap();
     ground.child.wait().unwrap();

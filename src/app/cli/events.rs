@@ -14,7 +14,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::arguments::output_or_standard;
-use super::log::{Level, is_json, note, say, say_entry};
+use super::log::{Level, is_json, log_json, note, say, say_entry};
 use super::output::{CommandError, cannot_write, json_text, print_notes};
 use crate::calibration::FoundBurst;
 use crate::calibration::solver::InstrumentEvent;
@@ -54,16 +54,25 @@ impl EventsArgs {
         self.events.as_deref().filter(|_| !self.take_stdout())
     }
 
-    /// Opens the output, if it is requested, and writes the first line. `outputs` are the main files of the command, which it must
-    /// not name.
+    /// Opens the output, if it is requested, and writes the first line, also of a log in JSON if `is_logging`. `outputs` are the main
+    /// files of the command, which it must not name.
     pub(super) fn start(
         &self,
         config: &Config,
         segment: &'static str,
         outputs: &[PathBuf],
+        is_logging: bool,
     ) -> Result<Events, CommandError> {
+        let is_logged = is_logging && is_json();
+        let log_begin = || {
+            if is_logged {
+                let (version, name) = (env!("CARGO_PKG_VERSION"), config.name.as_str());
+                say_entry(Level::Info, &Entry::Begin { version, name, segment }, None);
+            }
+        };
         let Some(path) = &self.events else {
-            return Ok(Events { writer: None, _file: ProtectedInputs::default() });
+            log_begin();
+            return Ok(Events { writer: None, is_logged, _file: ProtectedInputs::default() });
         };
         if outputs.iter().any(|output| is_same_name(output, path)) {
             let path = path.display();
@@ -76,14 +85,16 @@ impl EventsArgs {
             true => Box::new(std::io::stdout()),
             false => Box::new(growing_file(path).map_err(cannot_write(path))?),
         };
+        log_begin();
         let writer = Some(EventWriter::start(out, config.name.clone(), segment));
-        Ok(Events { writer, _file: ProtectedInputs::of([path]) })
+        Ok(Events { writer, is_logged, _file: ProtectedInputs::of([path]) })
     }
 }
 
-/// The output of events of a command, if it is requested.
+/// The output of events of a command, if it is requested, and the first and last line of a log in JSON.
 pub(super) struct Events {
     writer: Option<EventWriter>,
+    is_logged: bool,
     /// No product takes the place of the file.
     _file: ProtectedInputs,
 }
@@ -102,19 +113,19 @@ impl Events {
         result: &Result<T, CommandError>,
         cancelled: impl FnOnce(&T) -> bool,
     ) {
-        let Some(writer) = self.writer else { return };
-        let end = match result {
-            Ok(summary) => End {
-                status: if cancelled(summary) { "cancelled" } else { "complete" },
-                error: None,
-                // A summary always has a JSON form.
-                summary: serde_json::to_value(summary).unwrap_or_default(),
-            },
-            Err(error) => {
-                End { status: "failed", error: Some(error.to_string()), summary: serde_json::Value::Null }
-            }
+        let (status, error) = match result {
+            Ok(summary) => (if cancelled(summary) { "cancelled" } else { "complete" }, None),
+            Err(error) => ("failed", Some(error.to_string())),
         };
-        writer.end(end);
+        if self.is_logged {
+            // Without the summary, which is too long for a line of a log.
+            log_json(Level::Info, "end", &json!({ "status": status }), error.as_deref());
+        }
+        if let Some(writer) = self.writer {
+            // A summary always has a JSON form.
+            let summary = result.as_ref().ok().and_then(|summary| serde_json::to_value(summary).ok());
+            writer.end(End { status, error, summary: summary.unwrap_or_default() });
+        }
     }
 }
 

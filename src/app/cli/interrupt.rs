@@ -2,6 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
+use std::time::Duration;
 
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
@@ -21,8 +22,15 @@ const SIGNALS: [i32; 2] = [SIGINT, SIGTERM];
 /// Exit code of a command that a signal ended, minus the number of the signal; a convention of shells.
 const SHELL_BASE: i32 = 128;
 
-/// What an armed [`Interrupt`] sets at a signal: the run to cancel, and the signal's number.
-static ARMED: OnceLock<(Cancel, Arc<AtomicUsize>)> = OnceLock::new();
+/// Time after the first signal within which others are the same request: a shell or `timeout` may signal a process and its group.
+const SAME: Duration = Duration::from_millis(200);
+
+/// What an armed [`Interrupt`] sets at a signal: the run to cancel, the signal's number, and, [`SAME`] later, that the next ends the
+/// process.
+static ARMED: OnceLock<(Cancel, Arc<AtomicUsize>, Arc<AtomicBool>)> = OnceLock::new();
+
+/// Whether the thread of [`remove_files_on_signal`] runs.
+static IS_WATCHED: AtomicBool = AtomicBool::new(false);
 
 /// Makes signals remove the files that are being written before they end the process, in commands without an [`Interrupt`], and
 /// before that is armed. Without it, or if it fails, they end the process at once.
@@ -31,12 +39,17 @@ pub(super) fn remove_files_on_signal() {
     let ignored = ignored_signals();
     let handled = SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0);
     let Ok(mut signals) = signal_hook::iterator::Signals::new(handled) else { return };
+    IS_WATCHED.store(true, Ordering::Relaxed);
     std::thread::spawn(move || {
         for signal in signals.forever() {
-            if let Some((cancel, number)) = ARMED.get() {
+            if let Some((cancel, number, is_second)) = ARMED.get() {
                 // The signal may have come just before the handlers were installed.
                 number.store(signal.unsigned_abs() as usize, Ordering::Relaxed);
                 cancel.cancel();
+                if !is_second.load(Ordering::Relaxed) {
+                    std::thread::sleep(SAME);
+                    is_second.store(true, Ordering::Relaxed);
+                }
                 continue;
             }
             remove_unfinished();
@@ -60,19 +73,24 @@ impl Interrupt {
         &self.cancel
     }
 
-    /// Installs the handlers: the first signal cancels the run, the second ends the process immediately. Before this call, any signal
-    /// ends the process, as there is nothing to save. Signals that are ignored at the start, as by `nohup`, stay ignored.
+    /// Installs the handlers: the first signal cancels the run, a second, at least [`SAME`] later, ends the process immediately. Before
+    /// this call, any signal ends the process, as there is nothing to save. Signals that are ignored at the start, as by `nohup`,
+    /// stay ignored.
     ///
-    /// Everything happens in the signal handler, so that a blocked thread cannot delay it.
+    /// All but the wait for [`SAME`] happens in the signal handler, so that a blocked thread cannot delay it.
     fn arm(&self) -> std::io::Result<()> {
-        let _ = ARMED.set((self.cancel.clone(), Arc::clone(&self.signal)));
-        let ignored = ignored_signals();
         // A flag of its own: the thread of `remove_files_on_signal` may cancel before the shutdown looks.
         let is_second = Arc::new(AtomicBool::new(false));
+        let armed = (self.cancel.clone(), Arc::clone(&self.signal), Arc::clone(&is_second));
+        // Without the thread, or if it serves another run, nothing sets the flag later.
+        let is_watched = ARMED.set(armed).is_ok() && IS_WATCHED.load(Ordering::Relaxed);
+        let ignored = ignored_signals();
         for signal in SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0) {
             // The order matters: at the first signal, the shutdown must find the flag unset.
             flag::register_conditional_shutdown(signal, SHELL_BASE + signal, Arc::clone(&is_second))?;
-            flag::register(signal, Arc::clone(&is_second))?;
+            if !is_watched {
+                flag::register(signal, Arc::clone(&is_second))?;
+            }
             flag::register_usize(signal, Arc::clone(&self.signal), signal.unsigned_abs() as usize)?;
             flag::register(signal, self.cancel.flag())?;
         }

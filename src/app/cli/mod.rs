@@ -63,8 +63,10 @@ use clap::{CommandFactory, Parser, Subcommand};
 use serde_json::Value;
 
 use log::{Level, LogFormat};
-use output::{Completion, is_broken_pipe, print_error};
+use output::{Completion, WrongUsage, is_broken_pipe, print_error};
 
+use crate::downlink::DownlinkError;
+use crate::downlink::transport::socket::SocketError;
 use crate::ground::GroundError;
 use crate::pipeline::{ConfigError, PipelineError};
 use crate::units::InvalidValue;
@@ -176,9 +178,14 @@ fn is_configuration_error(error: &(dyn std::error::Error + 'static)) -> bool {
                 | MergeIntoPart { .. }
         )
     };
+    let is_socket_configuration = |error: &SocketError| {
+        use SocketError::{NoTruthFile, Remote, Stations};
+        matches!(error, NoTruthFile | Remote { .. } | Stations { .. })
+    };
     let is_pipeline_configuration = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
         PipelineError::Config(_) | PipelineError::Invalid(_) => true,
         PipelineError::Ground(error) => is_ground_configuration(error),
+        PipelineError::Downlink(DownlinkError::Socket(error)) => is_socket_configuration(error),
         _ => false,
     });
     // The program's own refusal of a name, as that of an output that is an input.
@@ -189,6 +196,8 @@ fn is_configuration_error(error: &(dyn std::error::Error + 'static)) -> bool {
         || error.downcast_ref::<std::io::Error>().is_some_and(is_refused_name)
         || error.is::<ConfigError>()
         || error.is::<InvalidValue>()
+        || error.is::<WrongUsage>()
+        || error.downcast_ref::<SocketError>().is_some_and(is_socket_configuration)
         || error.downcast_ref::<GroundError>().is_some_and(is_ground_configuration)
 }
 

@@ -31,6 +31,11 @@ impl Completion {
     }
 }
 
+/// Wrong usage that the parser of the command line does not see; exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(super) struct WrongUsage(pub(super) String);
+
 /// Makes the error of a file that cannot be written. It keeps the system's error, which decides the exit code.
 pub(super) fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> CommandError {
     move |source| WriteError { path: path.to_owned(), source }.into()

@@ -70,6 +70,9 @@ impl Progress {
                 }
                 view.log_events(&handles);
                 if is_over {
+                    if is_json() {
+                        view.show(&handles, stage);
+                    }
                     break;
                 }
                 if last.elapsed() >= every {

@@ -19,7 +19,7 @@ use super::job::Job;
 use super::lines::next_line;
 use super::log::{Level, is_json, note, say, say_entry};
 use super::output::{
-    CommandError, CommandResult, print_incompleteness, print_json_line, print_notes, print_text,
+    CommandError, CommandResult, WrongUsage, print_incompleteness, print_json_line, print_notes, print_text,
 };
 use super::progress::{Parts, Progress, time_left};
 use super::serving::{Page, ServeArgs};
@@ -33,7 +33,8 @@ use crate::frames::Instrument;
 use crate::ground::{ARCHIVE_BYTES_MAX, Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
 use crate::pipeline::{
     Config, ConfigSource, GroundSource, GroupSize, JobEvent, MemoryAdvice, MemoryLimit, PipelineError, READ,
-    RunSummary, SettingsOrigin, channel_groups, main_products, replay, replay_in_groups, use_threads,
+    RunSummary, SettingsOrigin, channel_groups, main_products, replay, replay_in_groups,
+    require_products_folder, use_threads,
 };
 
 /// Capacity of the hold buffer when listening without a state, bytes.
@@ -54,8 +55,9 @@ pub(super) struct ReplayArgs {
     /// Downlink files in the order of time.
     #[arg(required_unless_present_any = ["state", "listen"], value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
-    /// Map file (TOML): settings of the ground segment. Without it they are those of the state; else those of the run that made
-    /// the downlink, if its pipeline.toml lies beside the first FILE or it was the quicklook; else the defaults of `lunarray
+    /// Map file (TOML): settings of the ground segment. Without it they are those of the state, which has none of regulariser,
+    /// epsilon and products: these are then the defaults; without a state those of the run that made the
+    /// downlink, if its pipeline.toml lies beside the first FILE or it was the quicklook; else the defaults of `lunarray
     /// config`.
     #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
     map: Option<PathBuf>,
@@ -202,28 +204,17 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     if let Some(size) = args.groups {
         return in_groups(args, &config, size);
     }
-    let wait_bytes = match (&args.state, args.listens()) {
-        // Solving holds all visibilities of a pass until its gains are known, which needs the large buffer.
-        _ if config.calibration.hook == CalibrationHook::Solve => WAIT_BYTES,
-        (None, true) => WAIT_BYTES_LIVE,
-        _ => WAIT_BYTES,
-    };
-    let settings = args.with_memory_limit(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
-    let ground = match &args.state {
-        Some(folder) => Ground::open_with_ranks(folder, &settings, args.checkpoint_every, job.ranks())?,
-        None => Ground::new(&settings)?.with_ranks(job.ranks()),
-    };
-    if job.is_first() {
-        print_notes(ground.notes());
-    }
+    let reception = args.reception()?;
+    let ground = args.open_ground(&config, job)?;
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&config, "ground", args.state.as_deref(), Some(&args.out))?;
-    let events = args.events.start(&config, "ground", &main_products(&config, &args.out))?;
+    let outputs = main_products(&config, &args.out);
+    let events = args.events.start(&config, "ground", &outputs, job.is_first())?;
     let session = Session { args, config: &config, job, interrupt: &interrupt, page: &page, events: &events };
-    let result = match args.listens() {
-        true => session.receive_from_senders(ground),
-        false => session.read_files(ground),
+    let result = match reception {
+        Some(reception) => session.receive_from_senders(reception, ground),
+        None => session.read_files(ground),
     };
     if let Some(completion) = job.completion_if_interrupted(&result, &interrupt) {
         return Ok(completion);
@@ -263,16 +254,14 @@ impl ReplayArgs {
         let Some(state) = &self.state else { return Ok(()) };
         let path = state.display();
         if is_same_name(state, &self.out) {
-            return Err(
-                format!("--state {path}: it is also the folder of --out; expected two folders").into()
-            );
+            let text = format!("--state {path}: it is also the folder of --out; expected two folders");
+            return Err(WrongUsage(text).into());
         }
         // The parsers of names know only states that exist.
         let mut below = self.out.ancestors().skip(1).chain(self.events.file().and_then(Path::parent));
         if below.any(|folder| is_same_name(state, folder)) {
-            return Err(
-                format!("--state {path}: --out or --events lies in it; expected other folders").into()
-            );
+            let text = format!("--state {path}: --out or --events lies in it; expected other folders");
+            return Err(WrongUsage(text).into());
         }
         if self.files.is_empty() && !self.listens() && !Ground::is_state(state)? {
             return Err(format!(
@@ -281,6 +270,29 @@ impl ReplayArgs {
             .into());
         }
         Ok(())
+    }
+
+    /// Opens the state, or makes a ground without one.
+    fn open_ground(&self, config: &Config, job: &Job) -> Result<Ground, CommandError> {
+        let wait_bytes = match (&self.state, self.listens()) {
+            // Solving holds all visibilities of a pass until its gains are known, which needs the large buffer.
+            _ if config.calibration.hook == CalibrationHook::Solve => WAIT_BYTES,
+            (None, true) => WAIT_BYTES_LIVE,
+            _ => WAIT_BYTES,
+        };
+        let settings = self.with_memory_limit(config.ground(self.wait_bytes.unwrap_or(wait_bytes)));
+        if job.is_first() && self.state.as_deref().is_some_and(|folder| !folder.exists()) {
+            // A new state is made only if the products can be.
+            require_products_folder(config, &self.out)?;
+        }
+        let ground = match &self.state {
+            Some(folder) => Ground::open_with_ranks(folder, &settings, self.checkpoint_every, job.ranks())?,
+            None => Ground::new(&settings)?.with_ranks(job.ranks()),
+        };
+        if job.is_first() {
+            print_notes(ground.notes());
+        }
+        Ok(ground)
     }
 
     /// Adds the settings of the state, or else of the downlink, if there is no map file.
@@ -350,7 +362,7 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
     let groups = channel_groups(&args.files, config, size, args.memory_limit())?;
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();
-    let events = args.events.start(config, "ground", &main_products(config, &args.out))?;
+    let events = args.events.start(config, "ground", &main_products(config, &args.out), true)?;
     let mut parts = Parts::new(groups.iter().map(|group| group.channels.len() as f64));
     let mut progress = None;
     let result = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |event, view| {
@@ -382,6 +394,13 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
     interrupt.completion(summary.cancelled).after(printed)
 }
 
+/// Addresses of the sockets, and who may send to them.
+struct SocketReception {
+    connections: Vec<SocketAddr>,
+    datagrams: Vec<SocketAddr>,
+    stations: Option<Stations>,
+}
+
 /// Arguments, settings and outputs of a replay.
 struct Session<'a> {
     args: &'a ReplayArgs,
@@ -398,22 +417,32 @@ impl ReplayArgs {
         !self.listen.is_empty()
     }
 
+    /// What the sockets need; `None` without `--listen`.
+    fn reception(&self) -> Result<Option<SocketReception>, CommandError> {
+        if !self.listens() {
+            return Ok(None);
+        }
+        let [connections, datagrams] = self.listening_addresses()?;
+        let stations = self.stations.as_deref().map(Stations::read).transpose()?;
+        Ok(Some(SocketReception { connections, datagrams, stations }))
+    }
+
     /// Addresses for connections and for datagrams.
     fn listening_addresses(&self) -> Result<[Vec<SocketAddr>; 2], CommandError> {
+        let wrong = |text: &str| Err(WrongUsage(text.to_owned()).into());
         let mut found = [Vec::new(), Vec::new()];
         for url in &self.listen {
             let (kind, url) = match url {
                 ListenUrl::Tcp(url) => (0, url),
                 ListenUrl::Udp(_) if self.stations.is_some() => {
-                    return Err(
-                        "--listen udp:// with --stations: datagrams have no token; expected tcp:// alone"
-                            .into(),
+                    return wrong(
+                        "--listen udp:// with --stations: datagrams have no token; expected tcp:// alone",
                     );
                 }
                 ListenUrl::Udp(url) => (1, url),
             };
             if !found[kind].is_empty() {
-                return Err("--listen is given twice; expected at most one tcp:// and one udp://".into());
+                return wrong("--listen is given twice; expected at most one tcp:// and one udp://");
             }
             found[kind] = if self.allow_remote { url.addresses()? } else { url.loopback_addresses()? };
         }
@@ -423,9 +452,12 @@ impl ReplayArgs {
 
 impl Session<'_> {
     /// Receives the downlink from senders, until a limit or a signal.
-    fn receive_from_senders(&self, mut ground: Ground) -> Result<RunSummary, CommandError> {
+    fn receive_from_senders(
+        &self,
+        SocketReception { connections, datagrams, stations }: SocketReception,
+        mut ground: Ground,
+    ) -> Result<RunSummary, CommandError> {
         let Self { args, config, .. } = self;
-        let [connections, datagrams] = args.listening_addresses()?;
         // These settings only decide which instruments fit, so the size of the hold buffer does not matter.
         let acceptance = args.with_memory_limit(config.ground(0));
         let (is_warned, warning_config, limit) =
@@ -445,8 +477,8 @@ impl Session<'_> {
         if !datagrams.is_empty() {
             source = source.with_datagrams(&datagrams)?;
         }
-        if let Some(path) = &args.stations {
-            source = source.with_stations(Stations::read(path)?);
+        if let Some(stations) = stations {
+            source = source.with_stations(stations);
         }
         if args.state.is_some() {
             let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));

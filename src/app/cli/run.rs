@@ -79,7 +79,8 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "whole", None, None)?;
-    let events = args.events.start(&plan.config, "whole", &main_products(&plan.config, &out))?;
+    let outputs = main_products(&plan.config, &out);
+    let events = args.events.start(&plan.config, "whole", &outputs, job.is_first())?;
     let mut progress = None;
     let windows = plan.progress_windows();
     let result = run_with_ranks(job.ranks(), &plan, &out, interrupt.cancel(), &mut |handles| {

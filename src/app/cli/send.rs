@@ -5,9 +5,11 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use clap::Args;
+use serde_json::json;
 
 use super::arguments::input_path;
 use super::interrupt::Interrupt;
+use super::log::say;
 use super::output::{CommandResult, print_json_line, print_text};
 use super::replay::{Speed, speed};
 use crate::downlink::transport::socket::{SendOptions, SocketSink, Stations, TcpUrl};
@@ -56,7 +58,7 @@ pub(super) fn execute(args: &SendArgs) -> CommandResult {
     let interrupt = Interrupt::default();
     let token = args.token.as_ref().map(|path| Stations::read(path)?.only_token(path)).transpose()?;
     let options = SendOptions { connect_s: CONNECT_S, bytes_per_s: 0.0, held: args.held, token };
-    let socket = SocketSink::new(&args.to, options, interrupt.cancel())?;
+    let socket = SocketSink::new(&args.to, options, interrupt.cancel())?.with_wait_handler(say_waiting);
     let confirmed = socket.confirmed();
     let files = FileSource::open(&args.files)?;
     interrupt.arm_or_note();
@@ -66,11 +68,22 @@ pub(super) fn execute(args: &SendArgs) -> CommandResult {
     }?;
     let (bytes, to) = (confirmed.load(Ordering::Relaxed), &args.to);
     let printed = match args.json {
-        true => print_json_line(&serde_json::json!({ "confirmed": bytes, "to": to.to_string() })),
+        true => print_json_line(&json!({ "confirmed": bytes, "to": to.to_string() })),
         false if args.held => print_text(&format!("A checkpoint of {to} holds all {bytes} bytes")),
         false => print_text(&format!("{to} confirmed all {bytes} bytes")),
     };
     interrupt.completion(report.cancelled).after(printed)
+}
+
+/// Says that a ground has no checkpoint yet that holds everything.
+pub(super) fn say_waiting(to: &TcpUrl, bytes: u64, waited: Duration) {
+    let waited_s = waited.as_secs();
+    let fields = json!({ "to": to.to_string(), "bytes": bytes, "waited_s": waited_s });
+    say(
+        "waiting",
+        &fields,
+        format_args!("{waited_s} s: no checkpoint of {to} holds all {bytes} bytes yet; waiting"),
+    );
 }
 
 fn send<S: Source<Out = Vec<u8>> + 'static>(

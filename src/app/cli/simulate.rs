@@ -13,6 +13,7 @@ use super::output::{
     CommandError, CommandResult, print_config_notes, print_json_line, print_notes, print_text,
 };
 use super::progress::{GroupSteps, Progress};
+use super::send::say_waiting;
 use super::serving::ServeArgs;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, Stations, TcpUrl};
 use crate::files::ProtectedInputs;
@@ -98,8 +99,9 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let options =
         SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s, held: args.held, token };
     let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, cancel)).transpose()?;
+    let socket = socket.map(|socket| socket.with_wait_handler(say_waiting));
     let confirmed = socket.as_ref().map(SocketSink::confirmed);
-    let events = args.events.start(&plan.config, "space", args.out.as_slice())?;
+    let events = args.events.start(&plan.config, "space", args.out.as_slice(), true)?;
     let mut progress = None;
     let windows = plan.progress_windows();
     let file = args.out.clone().filter(|_| !to_standard_output);

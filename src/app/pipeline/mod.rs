@@ -19,7 +19,8 @@ pub use cost::{ChannelCost, Cost, GroupSize, MapGroup, MemoryAdvice, RankCost, R
 #[doc(hidden)]
 pub use graph::{
     BlockSummary, CalibrateRound, INTEGRATE, READ, RunScope, SampleCounts, SampleSummary, StepwiseRun,
-    SumsStorage, downlink_file, main_products, run_with_ranks, sample_stages, sky_notes, use_threads,
+    SumsStorage, downlink_file, main_products, require_products_folder, run_with_ranks, sample_stages,
+    sky_notes, use_threads,
 };
 pub use graph::{
     CalibrateSummary, Destination, GroundSource, OnStart, RunSummary, RunView, replay, run, simulate,

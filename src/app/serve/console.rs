@@ -181,6 +181,11 @@ impl Console {
         Some(Geometry::new(&array, self.earth))
     }
 
+    /// Number of channels that data can have; `None` before the instrument is known.
+    pub(super) fn channels(&self) -> Option<usize> {
+        self.ground()?.live_view.channels()
+    }
+
     /// Density of a channel's baselines in uvw; `None` if it has none.
     pub(super) fn uvw(&self, channel: ChannelId) -> Option<UvwDensity> {
         self.ground()?.live_view.density(channel)

@@ -130,7 +130,8 @@ async fn guard(State(page): State<PageState>, request: Request, next: Next) -> R
 
 fn refused(page: &PageState, method: &Method, uri: &Uri, headers: &HeaderMap) -> Option<Response> {
     if method != Method::GET && method != Method::HEAD {
-        let mut response = refusal(StatusCode::METHOD_NOT_ALLOWED, "this server is read-only; expected GET");
+        let mut response =
+            refusal(StatusCode::METHOD_NOT_ALLOWED, "this server is read-only; expected GET or HEAD");
         response.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
         return Some(response);
     }
@@ -281,14 +282,20 @@ async fn geometry(State(page): State<PageState>) -> Response {
     json(&page.console.geometry())
 }
 
+/// The number of a channel of the instrument; any, while the instrument is not known.
+fn known_channel(page: &PageState, text: &str) -> Option<ChannelId> {
+    let channels = page.console.channels();
+    parse_channel(text).filter(|found| channels.is_none_or(|channels| usize::from(found.0) < channels))
+}
+
 /// Density of a channel's baselines; `null` if it has none.
 async fn uvw(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
-    parse_channel(&channel).map_or_else(no_channel, |channel| json(&page.console.uvw(channel)))
+    known_channel(&page, &channel).map_or_else(no_channel, |channel| json(&page.console.uvw(channel)))
 }
 
 /// Map of a channel's visibilities by direction; `null` if it has none.
 async fn hits(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
-    let Some(channel) = parse_channel(&channel) else { return no_channel() };
+    let Some(channel) = known_channel(&page, &channel) else { return no_channel() };
     let console = Arc::clone(&page.console);
     match run_slow(&page, move || console.hits(channel)).await {
         Ok(hits) => json(&hits),
@@ -298,7 +305,7 @@ async fn hits(State(page): State<PageState>, Path(channel): Path<String>) -> Res
 
 /// Auto-correlation powers of a channel over time; `null` if it has none.
 async fn powers(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
-    parse_channel(&channel).map_or_else(no_channel, |channel| json(&page.console.powers(channel)))
+    known_channel(&page, &channel).map_or_else(no_channel, |channel| json(&page.console.powers(channel)))
 }
 
 async fn gaps(State(page): State<PageState>) -> Response {

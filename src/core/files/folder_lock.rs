@@ -24,8 +24,8 @@ pub struct FolderLock {
 impl FolderLock {
     /// Creates the folder if necessary and locks it with the file `name` in it. Removes unfinished files without a writer.
     ///
-    /// With `removes_lock`, dropping the lock removes this file, and the folder if it is new and empty, so that a run that fails
-    /// before its first product leaves nothing behind.
+    /// With `removes_lock`, or if the folder is new and still empty, dropping the lock removes this file, and the folder if it is new
+    /// and empty, so that a run that fails before its first product leaves nothing behind.
     ///
     /// # Errors
     /// The system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, has locked the folder.
@@ -69,7 +69,8 @@ impl FolderLock {
 
 impl Drop for FolderLock {
     fn drop(&mut self) {
-        if self.removes_lock && self.loss().is_none() {
+        let has_only_lock = || fs::read_dir(&self.folder).is_ok_and(|entries| entries.count() == 1);
+        if (self.removes_lock || (self.is_new && has_only_lock())) && self.loss().is_none() {
             let _ = fs::remove_file(&self.lock_path);
             if self.is_new {
                 // Fails if the folder is not empty.

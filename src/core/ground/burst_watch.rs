@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use std::mem;
 
 use super::DeliveredPacket;
-use super::hold_buffer::SendingKey;
 use crate::calibration::{BurstSearch, FoundBurst, FoundBursts, find_bursts};
+use crate::downlink::receive::SendingKey;
 use crate::frames::{PlacedFrame, PlacedVisibilities};
 use crate::units::ChannelId;
 

@@ -4,11 +4,10 @@ use std::collections::VecDeque;
 use std::path::Path;
 
 use super::collector_state::{CollectorState, CollectorView, headers};
-use super::hold_buffer::{HeldPacket, HoldBuffer, IsDue, SendingKey};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
-    ByteFeed, Decoder, DownlinkReceiver, Event, PacketInsertion, PacketOutcome, ReceivedSet,
-    ReceptionCounters,
+    ByteFeed, Decoder, DownlinkReceiver, Event, HeldPacket, HoldBuffer, IsDue, PacketInsertion,
+    PacketOutcome, ReceivedSet, ReceptionCounters, SendingKey,
 };
 use crate::downlink::wire::payload::visibilities_outline;
 use crate::downlink::wire::{PacketHeader, PacketKind, PacketSegment};

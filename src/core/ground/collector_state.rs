@@ -4,9 +4,8 @@ use std::collections::VecDeque;
 
 use bincode::{Decode, Encode};
 
-use super::hold_buffer::HoldBuffer;
 use crate::downlink::error::DownlinkError;
-use crate::downlink::receive::DecoderState;
+use crate::downlink::receive::{DecoderState, HoldBuffer};
 use crate::downlink::wire::PacketHeader;
 use crate::frames::Instrument;
 

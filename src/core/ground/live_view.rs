@@ -64,6 +64,7 @@ impl ArrayGeometry {
 
 #[derive(Debug, Default)]
 struct Views {
+    channels: Option<usize>,
     passes: Option<Arc<PassLine>>,
     array: Option<Arc<ArrayGeometry>>,
 }
@@ -93,6 +94,12 @@ impl LiveView {
     /// Requests an update from a busy stage. Call it at the intervals at which visitors expect updates.
     pub fn refresh(&self) {
         self.0.is_due.store(true, Ordering::Relaxed);
+    }
+
+    /// Number of channels that data can have; `None` before the instrument is known.
+    #[must_use]
+    pub fn channels(&self) -> Option<usize> {
+        self.views().channels
     }
 
     /// Packets received and missing over the mission.
@@ -229,6 +236,11 @@ impl LiveViewWriter {
         let Some(instrument) = collector.instrument() else { return };
         let passes = PassLine::new(instrument.epoch_tai_s, collector.received());
         let array = self.latest_s.and_then(|latest_s| ArrayGeometry::new(ephemeris, instrument, latest_s));
-        *self.live_view.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };
+        let spectrum = instrument.spectrometer.as_ref().map_or(0, |found| usize::from(found.channels));
+        *self.live_view.views() = Views {
+            channels: Some(instrument.channels.len() + spectrum),
+            passes: Some(Arc::new(passes)),
+            array: array.map(Arc::new),
+        };
     }
 }

@@ -14,7 +14,6 @@ mod collector_state;
 mod config;
 mod core;
 mod error;
-mod hold_buffer;
 mod live_view;
 mod outcome;
 mod pass_gate;
@@ -29,6 +28,8 @@ mod uvw_density;
 
 pub use self::core::Ground;
 #[doc(hidden)]
+pub use crate::downlink::receive::{HeldPacket, HoldBuffer, IsDue};
+#[doc(hidden)]
 pub use archive::{ARCHIVE_BYTES_MAX, packets_folder};
 #[doc(hidden)]
 pub use collector::{Collector, CollectorStep, DeliveredPacket, Delivery};
@@ -38,8 +39,6 @@ pub use collector_state::{CollectorState, CollectorView};
 pub use config::GroundConfig;
 pub use config::WAIT_BYTES;
 pub use error::GroundError;
-#[doc(hidden)]
-pub use hold_buffer::{HeldPacket, HoldBuffer, IsDue};
 #[doc(hidden)]
 pub use live_view::{ArrayGeometry, LiveView};
 #[doc(hidden)]

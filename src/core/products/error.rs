@@ -8,10 +8,10 @@ use crate::files::write_atomically;
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
 
-/// What to do about a folder that cannot be written. A refused name says itself what was expected.
+/// What to do about a folder that cannot be written. A refused name, and a folder in use, say themselves what was expected.
 fn folder_hint(source: &std::io::Error) -> &'static str {
     match source.kind() {
-        std::io::ErrorKind::InvalidInput => "",
+        std::io::ErrorKind::InvalidInput | std::io::ErrorKind::ResourceBusy => "",
         _ => "; expected a writable folder (choose one with --out)",
     }
 }

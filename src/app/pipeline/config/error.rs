@@ -182,15 +182,21 @@ pub enum PipelineError {
     },
     /// The last checkpoint of the ground segment could not be written.
     #[error(
-        "the state was not saved: {reason}. Maps and {} hold all data; the state holds that of its newest checkpoint: \
-         mend the cause, and replay the same files again",
-        summary.display()
+        "the state was not saved: {reason}. Maps and {} hold all data; the state holds that of its newest checkpoint: {}",
+        summary.display(),
+        if *is_archived {
+            "mend the cause; the next start adds what its raw archive has, so that nothing has to be sent again"
+        } else {
+            "mend the cause, and replay the same files again"
+        }
     )]
     Unsaved {
         /// Path of the summary.
         summary: std::path::PathBuf,
         /// Why the checkpoint could not be written.
         reason: String,
+        /// Whether a raw archive has the packets since that checkpoint.
+        is_archived: bool,
     },
     /// One rank of several was interrupted, so the ranks hold different data and no map can be made.
     #[error(

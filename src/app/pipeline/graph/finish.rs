@@ -71,7 +71,14 @@ pub(super) fn collect_and_write_summary(
         return Err(PipelineError::RankInterrupted);
     }
     if ranks.is_first() {
-        return write_summary(collect_summary(segment, config, out, finished)?, out);
+        let keeps_packets = finished.listening.as_ref().is_some_and(|listening| listening.archive.is_some());
+        let written = write_summary(collect_summary(segment, config, out, finished)?, out);
+        return written.map_err(|error| match error {
+            PipelineError::Unsaved { summary, reason, .. } => {
+                PipelineError::Unsaved { summary, reason, is_archived: keeps_packets }
+            }
+            error => error,
+        });
     }
     let FinishedGraph { report, outcome, .. } = finished;
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
@@ -142,7 +149,7 @@ pub(in crate::pipeline) fn write_summary(
 ) -> Result<RunSummary, PipelineError> {
     let path = summary.write(out)?;
     if let Some(reason) = summary.saving.as_ref().and_then(|saving| saving.unsaved.clone()) {
-        return Err(PipelineError::Unsaved { summary: path, reason });
+        return Err(PipelineError::Unsaved { summary: path, reason, is_archived: false });
     }
     if summary.channels.is_empty() && !summary.cancelled {
         return Err(PipelineError::NoMap { summary: path, ledger: Box::new(summary.ledger) });

@@ -19,8 +19,8 @@ pub use found_solutions::{CalibrateRound, CalibrateSummary};
 pub use joint::SumsStorage;
 pub(crate) use run::SHUTDOWN;
 pub use run::{
-    Destination, GroundSource, OnStart, READ, downlink_file, main_products, replay, run, run_with_ranks,
-    simulate, use_threads,
+    Destination, GroundSource, OnStart, READ, downlink_file, main_products, replay, require_products_folder,
+    run, run_with_ranks, simulate, use_threads,
 };
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;

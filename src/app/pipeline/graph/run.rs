@@ -420,8 +420,24 @@ pub(in crate::pipeline) fn lock_products(config: &Config, out: &Path) -> Result<
     lock_folder(out)
 }
 
+/// Requires that a run can lock the folder of its products, and leaves nothing behind.
+///
+/// # Errors
+/// A folder that cannot be written or is in use, or in which the run would replace an input.
+pub fn require_products_folder(config: &Config, out: &Path) -> Result<(), PipelineError> {
+    lock_products(config, out).map(drop)
+}
+
 /// Creates and locks a folder; before anything is computed, so that an error shows early.
 pub(in crate::pipeline) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
+    if let Ok(found) = out.symlink_metadata()
+        && !out.is_dir()
+    {
+        let what = if out.exists() || !found.is_symlink() { "not a folder" } else { "a link to nothing" };
+        let reason = format!("it is {what}; expected a folder, or a name that is free");
+        let source = io::Error::new(io::ErrorKind::InvalidInput, reason);
+        return Err(ProductsError::Write { path: out.to_owned(), source }.into());
+    }
     let locked = FolderLock::acquire(out, ".lock", true);
     Ok(locked.map_err(ProductsError::write(out))?)
 }

@@ -41,6 +41,15 @@ impl DownlinkReceiver {
 
     /// Takes the next bytes of the stream.
     pub fn push(&mut self, bytes: &[u8]) {
+        self.push_with(bytes, CaduReceiver::push);
+    }
+
+    /// Takes the next bytes of the stream, a datagram that begins with a coded frame.
+    pub fn push_frame(&mut self, bytes: &[u8]) {
+        self.push_with(bytes, CaduReceiver::push_frame);
+    }
+
+    fn push_with(&mut self, bytes: &[u8], push: fn(&mut CaduReceiver, &[u8], &mut Vec<u8>)) {
         self.keep_head(bytes);
         self.bytes += bytes.len() as u64;
         if self.format != Some(Format::Cadu) {
@@ -52,7 +61,7 @@ impl DownlinkReceiver {
         }
         if self.format != Some(Format::Packets) {
             self.recovered.clear();
-            self.frames.push(bytes, &mut self.recovered);
+            push(&mut self.frames, bytes, &mut self.recovered);
             self.forward_recovered();
         }
     }

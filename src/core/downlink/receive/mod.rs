@@ -6,6 +6,7 @@
 //! | bytes to packets, gaps and damage | [`PacketReceiver`] |
 //! | either format, which is detected | [`DownlinkReceiver`], [`EventReader`] |
 //! | packets to ground frames | [`Decoder`] |
+//! | packets that have to wait for others | [`HoldBuffer`] |
 //! | a file, compressed or not, to bytes | [`DownlinkFile`] |
 //! | a file to a summary of its contents | [`inspect`] |
 //!
@@ -19,6 +20,7 @@ mod downlink_file;
 mod downlink_receiver;
 mod event_reader;
 mod format_detection;
+mod hold_buffer;
 pub mod inspect;
 mod listing;
 mod packet_receiver;
@@ -30,6 +32,8 @@ pub use decoder::{Decoder, DecoderState};
 pub use downlink_file::DownlinkFile;
 pub use downlink_receiver::DownlinkReceiver;
 pub use event_reader::{ByteFeed, EventReader};
+pub(crate) use hold_buffer::SendingKey;
+pub use hold_buffer::{HeldPacket, HoldBuffer, IsDue};
 pub use listing::{LISTED_MAX, Listing};
 pub use packet_receiver::{Event, Packet, PacketReceiver};
 pub use received_set::{Era, PacketInsertion, ReceivedSet};

@@ -3,8 +3,8 @@
 use bincode::{Decode, Encode};
 
 use crate::downlink::CucTime;
+use crate::downlink::receive::SendingKey;
 use crate::frames::VisibilityBlock;
-use crate::ground::hold_buffer::SendingKey;
 use crate::units::{ChannelId, MissionTime, Pair};
 
 /// Summary of one packet of visibilities, as received.

@@ -10,11 +10,11 @@ use bincode::{Decode, Encode};
 use super::draft::RecordDraft;
 use super::entry::JournalEntry;
 use crate::downlink::receive::PacketOutcome;
+pub(in crate::ground) use crate::downlink::receive::SendingKey;
 use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
 use crate::downlink::{PacketHeader, PacketKind};
 use crate::frames::{Housekeeping, VisibilityReason};
 use crate::ground::DeliveredPacket;
-pub(in crate::ground) use crate::ground::hold_buffer::SendingKey;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime};
 

@@ -110,6 +110,23 @@ impl CaduReceiver {
         self.drop_processed();
     }
 
+    /// Takes bytes as [`CaduReceiver::push`] does, which are one whole frame, as in a datagram. The first tells the interleave by its
+    /// length, so that no other has to follow it.
+    pub fn push_frame(&mut self, bytes: &[u8], out: &mut Vec<u8>) {
+        let at = 8 * self.buffer.len();
+        let mut codes = INTERLEAVES.into_iter().filter_map(ReedSolomon::new);
+        if self.code.is_none()
+            && let Some(code) = codes.find(|code| frame_bits(*code) == 8 * bytes.len())
+            && let Some(polarity) = marker_polarity(word_at(bytes, 0))
+        {
+            self.buffer.extend_from_slice(bytes);
+            let is_frame = self.correct(at, code, polarity).is_some() && self.header().is_some();
+            self.code = Some(code).filter(|_| is_frame && !self.is_constant());
+            self.buffer.truncate(at / 8);
+        }
+        self.push(bytes, out);
+    }
+
     /// Ends the stream. Another one may follow, with the same interleave, polarity and counters.
     pub fn finish(&mut self, out: &mut Vec<u8>) {
         self.process(true, out);

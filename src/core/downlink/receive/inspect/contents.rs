@@ -59,7 +59,7 @@ pub struct KindSummary {
     pub packets: u64,
     /// Bytes of these packets.
     pub bytes: u64,
-    /// Count of the first packet received, which is the number of packets sent before it.
+    /// Lowest count received: unless counts restarted, the number of packets sent before it.
     pub first_count: Option<u64>,
     /// Highest count received.
     pub last_count: Option<u64>,
@@ -148,7 +148,7 @@ pub struct GapEntry {
     pub count: u64,
     /// Offset of the packet after the gap, bytes.
     pub offset: u64,
-    /// Creation time of the last packet before the gap, s since the mission epoch.
+    /// Creation time of the packet before the gap, s since the mission epoch.
     pub after_s: Option<f64>,
     /// Creation time of the packet after the gap, s since the mission epoch.
     pub before_s: Option<f64>,

@@ -4,15 +4,15 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::Path;
 
+use super::any_order::{AnyOrderDecoder, DecodeResult};
 use super::contents::{
     ChannelContents, Contents, DamagedEntry, EphemerisSummary, FaultEntry, GapEntry, GarbageEntry,
     HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
 };
+use super::packet_gaps::{PacketGap, SeenPackets};
 use crate::array::{earth_is_hidden_by_date, interpolation_error_m};
 use crate::downlink::error::DownlinkError;
-use crate::downlink::receive::{
-    Decoder, DownlinkFile, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters,
-};
+use crate::downlink::receive::{DownlinkFile, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters};
 use crate::downlink::wire::{CucTime, Format, PacketHeader, PacketKind};
 use crate::frames::{
     AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, Spectrometer, VisibilityBlock,
@@ -58,25 +58,23 @@ impl Contents {
         visit: &mut dyn FnMut(&GroundFrame),
     ) -> Result<Self, DownlinkError> {
         let mut events = EventReader::new(source, path);
-        let mut decoder = Decoder::new();
+        let mut decoder = AnyOrderDecoder::default();
         let mut inspector = Inspector::default();
         events.for_each(|event| {
             inspector.add_event(event);
-            if let Some(frame) = decoder.accept(event) {
-                inspector.add_frame(&frame);
-                visit(&frame);
-            }
-            if let Some((offset, fault)) = decoder.take_fault() {
-                inspector.faults.push(FaultEntry { offset, reason: fault.to_string() });
-            }
+            decoder.accept(event, &mut |result| inspector.add_result(result, visit));
             Ok::<(), DownlinkError>(())
         })?;
-        decoder.finish();
+        decoder.finish(&mut |result| inspector.add_result(result, visit));
         events.require_packets()?;
         let receiver = events.receiver();
         let mut reception = ReceptionCounters { frames: receiver.frames(), ..decoder.counters().clone() };
         for kind in PacketKind::ALL {
-            reception.kind_mut(kind).restarts = receiver.restarts(kind);
+            let counts = reception.kind_mut(kind);
+            counts.restarts = receiver.restarts(kind);
+            let missing = inspector.seen[kind.index()].gaps().map(|gap| gap.to - gap.from + 1);
+            (counts.gaps, counts.missing) =
+                missing.fold((0, 0_u64), |(n, sum), count| (n + 1, sum.saturating_add(count)));
         }
         Ok(inspector.into_contents(path, receiver.bytes(), &reception))
     }
@@ -102,12 +100,11 @@ impl Tally {
     }
 }
 
-/// First and last count of the packets of one kind, and their latest creation time.
+/// Lowest and highest count of the packets of one kind.
 #[derive(Clone, Copy, Debug, Default)]
 struct KindExtent {
     first: Option<u64>,
     last: Option<u64>,
-    time: Option<CucTime>,
 }
 
 #[derive(Debug, Default)]
@@ -128,7 +125,7 @@ struct Inspector {
     covered: EphemerisCoverage,
     housekeeping: Option<Housekeeping>,
     extents: [KindExtent; PacketKind::ALL.len()],
-    gaps: Listing<(GapEntry, Option<CucTime>, CucTime)>,
+    seen: [SeenPackets; PacketKind::ALL.len()],
     damaged: Listing<(DamagedEntry, CucTime)>,
     garbage: Listing<GarbageEntry>,
     faults: Listing<FaultEntry>,
@@ -138,39 +135,37 @@ struct Inspector {
 impl Inspector {
     fn add_event(&mut self, event: &Event<'_>) {
         match *event {
-            Event::Packet(packet) => self.add_packet(packet.header),
-            Event::Gap { offset, header, expected } => {
-                let PacketHeader { kind, count: found, time, .. } = header;
-                let after = self.extents[kind.index()].time;
-                let entry = GapEntry {
-                    kind,
-                    apid: kind.apid(),
-                    from: expected,
-                    to: found.saturating_sub(1),
-                    count: found.saturating_sub(expected),
-                    offset,
-                    after_s: None,
-                    before_s: None,
-                };
-                self.gaps.push((entry, after, time));
-            }
+            Event::Packet(packet) => self.add_packet(packet.header, packet.offset),
             Event::Damaged { offset, header, .. } => {
                 let PacketHeader { kind, count, time, bytes, .. } = header;
                 let apid = kind.apid();
                 let entry = DamagedEntry { offset, kind, apid, count, bytes: bytes as u64, time_s: None };
                 self.damaged.push((entry, time));
+                self.seen[kind.index()].add(&header, offset);
             }
             Event::Idle { bytes, .. } => self.idle_bytes += bytes,
             Event::Garbage { offset, bytes } => self.garbage.push(GarbageEntry { offset, bytes }),
-            Event::Duplicate { .. } | Event::Restart { .. } | Event::Truncated { .. } => {}
+            // Later packets may close a gap: gaps are found at the end, among all packets.
+            Event::Gap { .. } | Event::Duplicate { .. } | Event::Restart { .. } | Event::Truncated { .. } => {
+            }
         }
     }
 
-    fn add_packet(&mut self, header: PacketHeader) {
+    fn add_result(&mut self, result: DecodeResult, visit: &mut dyn FnMut(&GroundFrame)) {
+        match result {
+            Ok(frame) => {
+                self.add_frame(&frame);
+                visit(&frame);
+            }
+            Err((offset, fault)) => self.faults.push(FaultEntry { offset, reason: fault.to_string() }),
+        }
+    }
+
+    fn add_packet(&mut self, header: PacketHeader, offset: u64) {
+        self.seen[header.kind.index()].add(&header, offset);
         let extent = &mut self.extents[header.kind.index()];
-        extent.first.get_or_insert(header.count);
+        extent.first = Some(extent.first.map_or(header.count, |first| first.min(header.count)));
         extent.last = extent.last.max(Some(header.count));
-        extent.time = extent.time.max(Some(header.time));
     }
 
     fn add_frame(&mut self, frame: &GroundFrame) {
@@ -236,11 +231,21 @@ impl Inspector {
     fn into_contents(self, path: &Path, bytes: u64, reception: &ReceptionCounters) -> Contents {
         let epoch_tai_s = self.instrument.as_ref().map(|instrument| instrument.epoch_tai_s);
         let mission_s = |time: CucTime| epoch_tai_s.map(|epoch_tai_s| time.tai_s() - epoch_tai_s);
-        let place_gap = |(gap, after, before): (GapEntry, Option<CucTime>, CucTime)| GapEntry {
-            after_s: after.and_then(mission_s),
-            before_s: mission_s(before),
-            ..gap
-        };
+        let mut gaps = Listing::default();
+        for kind in PacketKind::ALL {
+            for PacketGap { from, to, after, before, offset } in self.seen[kind.index()].gaps() {
+                gaps.push(GapEntry {
+                    kind,
+                    apid: kind.apid(),
+                    from,
+                    to,
+                    count: to - from + 1,
+                    offset,
+                    after_s: mission_s(after),
+                    before_s: mission_s(before),
+                });
+            }
+        }
         let place_damaged =
             |(entry, time): (DamagedEntry, CucTime)| DamagedEntry { time_s: mission_s(time), ..entry };
         let packets = PacketKind::ALL.map(|kind| {
@@ -280,7 +285,7 @@ impl Inspector {
                 sampled: counts.sampled,
                 dropped: counts.dropped,
             }),
-            gaps: map_listing(self.gaps, place_gap),
+            gaps,
             bad_checksums: map_listing(self.damaged, place_damaged),
             garbage: self.garbage,
             faults: self.faults,

@@ -184,6 +184,33 @@ impl Contents {
         Ok(())
     }
 
+    /// The verdict on a file that is not known to be sound.
+    fn show_verdict(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let verdict = match self.is_undamaged() {
+            true => "not known to be sound: no gaps, no bad checksums, no garbage, not truncated, but",
+            false => "not sound: packets are missing, damaged or not readable, as listed below;",
+        };
+        match self.found_minus_reported().zip(self.housekeeping.as_ref()) {
+            None => writeln!(
+                f,
+                "\n{verdict} no report of the spacecraft's counts: it is not known whether visibilities are missing"
+            ),
+            Some((excess, HousekeepingSummary { sampled, dropped, .. })) if excess < 0 => writeln!(
+                f,
+                "\nnot sound: {} of {sampled} visibilities that were sampled are not in this file ({dropped} were dropped on board)",
+                excess.unsigned_abs()
+            ),
+            Some((excess, _)) if excess > 0 => writeln!(
+                f,
+                "\n{verdict} {excess} visibilities follow the last report of the spacecraft's counts: it is not known whether others are missing"
+            ),
+            Some(_) => writeln!(
+                f,
+                "\n{verdict} all visibilities that were sampled and not dropped on board are in this file"
+            ),
+        }
+    }
+
     fn show_damage(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if let Some(restarts) = self.reception.restarts_text() {
             writeln!(f, "\n{restarts}")?;
@@ -195,25 +222,7 @@ impl Contents {
                  dropped on board are in this file"
             );
         }
-        if self.is_undamaged() {
-            writeln!(f, "\nno gaps, no bad checksums, no garbage, not truncated")?;
-        }
-        match self.found_minus_reported().zip(self.housekeeping.as_ref()) {
-            None => writeln!(
-                f,
-                "\nno report of the spacecraft's counts: it is not known whether visibilities are missing"
-            )?,
-            Some((excess, HousekeepingSummary { sampled, dropped, .. })) if excess < 0 => writeln!(
-                f,
-                "\nnot sound: {} of {sampled} visibilities that were sampled are not in this file ({dropped} were dropped on board)",
-                excess.unsigned_abs()
-            )?,
-            Some((excess, _)) if excess > 0 => writeln!(
-                f,
-                "\n{excess} visibilities follow the last report of the spacecraft's counts: it is not known whether others are missing"
-            )?,
-            Some(_) => {}
-        }
+        self.show_verdict(f)?;
         show_list(f, "gaps", &self.gaps, |gap| {
             format!(
                 "{}: {} to {}, {} packets, before byte {}",
@@ -241,8 +250,8 @@ impl Contents {
             let visibilities = self.reception.visibilities_before_instrument;
             writeln!(
                 f,
-                "\n{payloads} payloads with {visibilities} visibilities precede the first instrument description and are in no \
-                table above; a replay keeps them until the description arrives"
+                "\n{payloads} payloads with {visibilities} visibilities could not be read, as no instrument description came in time; they \
+                 are in no table above"
             )?;
         }
         if self.reception.instruments_contradictory > 0 {

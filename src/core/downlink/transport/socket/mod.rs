@@ -65,7 +65,7 @@ pub use report::{
     StationCounts,
 };
 
-pub use sink::{SendOptions, SocketSink};
+pub use sink::{SendOptions, SocketSink, WaitHandler};
 #[cfg(not(target_family = "wasm"))]
 pub use source::SocketSource;
 pub use stations::Stations;

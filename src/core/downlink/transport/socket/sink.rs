@@ -30,6 +30,10 @@ const RESEND_BYTES_MAX: usize = 1 << 24;
 const PAUSE: Duration = Duration::from_millis(200);
 const PAUSE_MAX: Duration = Duration::from_secs(5);
 
+/// Wait for a checkpoint of the receiver after which it is reported, and interval of further reports.
+const WAIT: Duration = Duration::from_secs(5);
+const WAIT_EVERY: Duration = Duration::from_secs(30);
+
 const ANSWER_BYTES_MAX: u64 = 1 << 10;
 
 /// Options for sending.
@@ -44,6 +48,9 @@ pub struct SendOptions {
     /// Token of the station, for a receiver that requires one.
     pub token: Option<String>,
 }
+
+/// Reports that a sender still waits for a checkpoint: to where, the bytes that it has to hold, and the wait so far.
+pub type WaitHandler = fn(to: &TcpUrl, bytes: u64, waited: Duration);
 
 /// Sends a byte stream to a listening ground. Connects with the first bytes, and blocks while the receiver does not read.
 ///
@@ -62,6 +69,7 @@ pub struct SocketSink {
     /// The stream from its beginning; `None` once it exceeds [`RESEND_BYTES_MAX`].
     sent: Option<Vec<u8>>,
     confirmed: Arc<AtomicU64>,
+    on_wait: Option<WaitHandler>,
 }
 
 impl SocketSink {
@@ -80,7 +88,14 @@ impl SocketSink {
             bytes: 0,
             sent: Some(Vec::new()),
             confirmed: Arc::default(),
+            on_wait: None,
         })
+    }
+
+    /// Calls `on_wait` while the answer of a receiver that is to hold everything takes long.
+    #[must_use]
+    pub fn with_wait_handler(self, on_wait: WaitHandler) -> Self {
+        Self { on_wait: Some(on_wait), ..self }
     }
 
     /// Number of bytes that the receiver has confirmed: all, or 0 before its answer.
@@ -284,9 +299,16 @@ impl SocketSink {
             return Err(self.refusal(stream, &error));
         }
         let since = Instant::now();
+        let mut report_after = WAIT;
         let mut answer = Vec::new();
         let mut piece = [0; 256];
         loop {
+            if let Some(on_wait) =
+                self.on_wait.filter(|_| self.options.held && since.elapsed() >= report_after)
+            {
+                on_wait(&self.url, self.bytes, since.elapsed());
+                report_after += WAIT_EVERY;
+            }
             match stream.read(&mut piece) {
                 Ok(0) => return Ok(String::from_utf8_lossy(&answer).trim().to_owned()),
                 Ok(bytes) if answer.len() as u64 + bytes as u64 > ANSWER_BYTES_MAX => {
@@ -340,5 +362,40 @@ impl Sink for SocketSink {
 
     fn units(&self) -> Units {
         Units::of(self.bytes, "bytes")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+    use std::sync::atomic::AtomicBool;
+
+    use super::*;
+
+    #[test]
+    fn a_sender_that_waits_for_a_checkpoint_says_so() {
+        static IS_TOLD: AtomicBool = AtomicBool::new(false);
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let url = TcpUrl::from(listener.local_addr().unwrap());
+        let ground = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            stream.read_to_end(&mut Vec::new()).unwrap();
+            writeln!(stream, "taken 3 bytes").unwrap();
+            // No checkpoint before the sender has said that it waits.
+            while !IS_TOLD.load(Ordering::Relaxed) {
+                std::thread::sleep(POLL);
+            }
+            writeln!(stream, "held 3 bytes").unwrap();
+        });
+        let options = SendOptions { connect_s: 5.0, bytes_per_s: 0.0, held: true, token: None };
+        let sink = SocketSink::new(&url, options, &Cancel::new()).unwrap();
+        let mut sink = sink.with_wait_handler(|_, bytes, waited| {
+            assert!(bytes == 3 && waited >= WAIT);
+            IS_TOLD.store(true, Ordering::Relaxed);
+        });
+        sink.take(vec![1, 2, 3]).unwrap();
+        sink.finish().unwrap();
+        assert_eq!(sink.confirmed().load(Ordering::Relaxed), 3);
+        ground.join().unwrap();
     }
 }

@@ -92,7 +92,7 @@ impl StreamReceiver {
         self.forward(out)
     }
 
-    /// Takes a datagram that continues the previous one, as [`StreamReceiver::receive`] does.
+    /// Takes a datagram that begins with a frame and continues the previous one, as [`StreamReceiver::receive`] does.
     ///
     /// # Errors
     /// The instrument is refused, or was not confirmed in time.
@@ -101,7 +101,7 @@ impl StreamReceiver {
         bytes: &[u8],
         out: &mut Vec<u8>,
     ) -> Result<Activity, ConnectionEnd> {
-        self.receiver.push(bytes);
+        self.receiver.push_frame(bytes);
         self.forward(out)
     }
 
@@ -294,7 +294,11 @@ mod tests {
     }
 
     fn transmit(name: &str, format: Format, block: Option<GroundFrame>) -> Vec<u8> {
-        let config = DownlinkConfig { packet_bytes_max: 512, format, ..DownlinkConfig::default() };
+        transmit_with(name, &DownlinkConfig { format, ..DownlinkConfig::default() }, block)
+    }
+
+    fn transmit_with(name: &str, config: &DownlinkConfig, block: Option<GroundFrame>) -> Vec<u8> {
+        let config = DownlinkConfig { packet_bytes_max: 512, ..config.clone() };
         let (mut transmission, mut bytes) = (Transmission::new(&config).unwrap(), Vec::new());
         let positions_m = (0..8 * 40).map(|k| [f64::from(k), -2e6, 0.5]).collect();
         let frames = [
@@ -341,6 +345,27 @@ mod tests {
                 assert!(forwarded <= 3, "{forwarded}");
                 assert_eq!(sender.format(), Some(format));
             }
+        }
+    }
+
+    #[test]
+    fn every_frame_in_a_datagram_of_its_own_is_taken_at_once() {
+        for frame_bytes in [4 + 255, 4 + 5 * 255, 4 + 8 * 255] {
+            let interleave = (frame_bytes - 4) / 255;
+            let config = DownlinkConfig { interleave, format: Format::Cadu, ..DownlinkConfig::default() };
+            let frames = transmit_with("ours", &config, None);
+            let mut sender = StreamReceiver::new(reception(), preamble());
+            let mut out = Vec::new();
+            // Bad ones first: half a frame, and a whole one that cannot be corrected.
+            let mut bad = frames[..frame_bytes].to_vec();
+            bad[4..].fill(0x55);
+            for datagram in [&frames[..frame_bytes / 2], &bad] {
+                assert!(!sender.receive_continued(datagram, &mut out).unwrap().has_valid);
+            }
+            for frame in frames.chunks(frame_bytes) {
+                assert!(sender.receive_continued(frame, &mut out).unwrap().has_valid, "{frame_bytes}");
+            }
+            assert!(out == sent("ours", Format::Packets));
         }
     }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use bincode::{Decode, Encode};
 
-use crate::downlink::receive::Packet;
+use super::Packet;
 use crate::downlink::wire::payload::visibilities_outline;
 use crate::downlink::wire::{
     COUNT_MAX, CucTime, PACKET_BYTES_MAX, PacketHeader, PacketKind, PacketSegment, VisibilitiesOutline,
@@ -26,7 +26,7 @@ const SEGMENTS_MAX: usize = 4096;
 pub type IsDue<'a> = &'a dyn Fn(&VisibilitiesOutline) -> bool;
 
 /// Key of a packet in the order of sending within its kind: creation time and count.
-pub(super) type SendingKey = (CucTime, u64);
+pub(crate) type SendingKey = (CucTime, u64);
 
 /// A packet in the hold buffer.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
@@ -119,7 +119,7 @@ impl HoldBuffer {
     }
 
     /// Whether inserting packets could have produced this state. Checkpoints are untrusted.
-    pub(super) fn is_sound(&self) -> bool {
+    pub(crate) fn is_sound(&self) -> bool {
         let is_packet =
             |packet: &HeldPacket| packet.header.count <= COUNT_MAX && packet.header.bytes <= PACKET_BYTES_MAX;
         let key_of = |packet: &HeldPacket| (packet.header.time, packet.header.count);
