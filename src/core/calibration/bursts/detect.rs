@@ -19,8 +19,10 @@ use std::collections::BTreeMap;
 use std::f64::consts::LN_2;
 use std::ops::Range;
 
-use super::locate::{KnownBody, Sample, locate};
+use super::flux::{Flux, Place};
+use super::locate::{Sample, locate};
 use super::peel::BurstRow;
+use super::refine::{name, refine};
 use super::{BurstChoice, FoundBurst, LightCurve};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::{median, percentiles};
@@ -278,7 +280,7 @@ fn describe(
 ) -> Option<FoundBurst> {
     let mut brightest = bins.brightest(range.clone());
     brightest.truncate(BRIGHTEST);
-    let (peak, first) = (*brightest.first()?, pairs.first()?.first()?);
+    let (peak, block) = (*brightest.first()?, pairs.first()?.first()?.block);
     // A power for each half of a bin, as a burst may be as short as an integration, of which a bin holds two or more.
     let samples: Vec<Vec<Sample>> = brightest
         .iter()
@@ -290,27 +292,34 @@ fn describe(
         })
         .collect();
     let peak_s = bins.start_s(peak) + 0.5 * bins.width_s;
-    let located = locate(&samples, search.moon_radius_m, &KnownBody::all(search.epoch_tai_s, peak_s))?;
-    let jy = k_sr_per_jy(first.block.frequency_hz).recip();
     let span_s = [range.start, range.end].map(|bin| bins.start_s(bin));
-    let hat = located.directions.first().filter(|_| search.choice == BurstChoice::Peel);
-    let light_curve =
-        hat.and_then(|hat| LightCurve::fit(&rows_of(pairs, span_s), *hat, span_s, search.moon_radius_m));
+    let rows = rows_of(pairs, span_s);
+    let candidates = locate(&samples, search.moon_radius_m);
+    let (located, smears) = refine(search, &candidates, &rows, span_s);
+    let hat = located.first().map_or(candidates.first()?.hat, |place| place.hat);
+    let flux = Flux::fit(&rows, Place { hat, moon_radius_m: search.moon_radius_m, smears }, span_s);
+    let peak_span_s = [peak, peak + 1].map(|bin| bins.start_s(bin));
+    // Rows that determine no flux, as of one daughter behind the Moon, are a burst still.
+    let [power_k_sr, power_sigma_k_sr] = flux.map_or([0.0; 2], |flux| flux.mean_k_sr(&rows, peak_span_s));
+    let jy = k_sr_per_jy(block.frequency_hz).recip();
+    let is_peeled = search.choice == BurstChoice::Peel;
+    let fit = || LightCurve::fit(&rows, hat, span_s, search.moon_radius_m);
     Some(FoundBurst {
-        channel: first.block.channel.0,
-        frequency_hz: first.block.frequency_hz,
+        channel: block.channel.0,
+        frequency_hz: block.frequency_hz,
         from_s: span_s[0],
         until_s: span_s[1],
         peak_s,
-        significance: located.significance,
-        flux_jy: jy * located.power_k_sr,
-        flux_sigma_jy: jy * located.power_sigma_k_sr,
-        positions_deg: located.directions.iter().map(|hat| ecliptic_deg(*hat)).collect(),
-        position_sigma_deg: located.sigma_rad.to_degrees(),
-        name: located.name.map(str::to_owned),
+        peak_span_s,
+        significance: candidates.first()?.twice_log.max(0.0).sqrt(),
+        flux_jy: jy * power_k_sr,
+        flux_sigma_jy: jy * power_sigma_k_sr,
+        positions_deg: located.iter().map(|place| ecliptic_deg(place.hat)).collect(),
+        position_errors_deg: located.iter().map(|place| place.errors_rad.map(f64::to_degrees)).collect(),
+        name: name(search, peak_s, &located).map(str::to_owned),
         seen_from_m: seen_from_m(pairs, span_s),
         moon_radius_m: search.moon_radius_m,
-        light_curve,
+        light_curve: if is_peeled { fit() } else { None },
     })
 }
 
@@ -350,7 +359,8 @@ fn samples_of(pair: &[Entry], is_in: impl Fn(f64) -> bool) -> Vec<Sample> {
             response: AntennaResponse::Isotropic,
         };
         let variance_k2_sr2 = kept * steady_k2_sr2 + 2.0 / block.weight[k];
-        Sample { geometry, value_k_sr: block.value_k_sr[k], information: variance_k2_sr2.recip() }
+        let (value_k_sr, information) = (block.value_k_sr[k], variance_k2_sr2.recip());
+        Sample { geometry, value_k_sr, information, template: 1.0 }
     };
     inside.iter().step_by(step).map(sample).collect()
 }

@@ -4,8 +4,10 @@
 //! visibilities that arrive later out as well.
 
 mod detect;
+mod flux;
 mod locate;
 mod peel;
+mod refine;
 
 pub use detect::{BurstSearch, find_bursts};
 pub(super) use locate::{Sample, locate};
@@ -65,18 +67,20 @@ pub struct FoundBurst {
     pub until_s: f64,
     /// Time of the brightest interval, s.
     pub peak_s: f64,
+    /// Start and end of the brightest interval, s.
+    pub peak_span_s: [f64; 2],
     /// Signal-to-noise ratio of a point source at the position. The noise is that of the visibilities and the steady sky.
     pub significance: f64,
-    /// Flux density in that half of an interval in which it is most significant, as an isotropic antenna sees it, Jy.
+    /// Mean flux density in the brightest interval, as an isotropic antenna sees it, Jy.
     pub flux_jy: f64,
     /// Standard deviation of the flux density, Jy.
     pub flux_sigma_jy: f64,
-    /// Ecliptic longitude and latitude, deg, the likeliest first; others have a likelihood within 99 % of its distribution: daughters in
+    /// Ecliptic longitude and latitude, deg, the likeliest first, if there is one; others have a likelihood within 99 % of its distribution: daughters in
     /// one plane do not tell its two sides apart.
     pub positions_deg: Vec<[f64; 2]>,
-    /// Standard deviation of the first position along its worst direction, deg. Too small for arrays of few wavelengths, as the steady sky is
-    /// the same at all times.
-    pub position_sigma_deg: f64,
+    /// Standard deviations of each position along the longer and the shorter axis of its error ellipse, and the angle of the longer axis from
+    /// ecliptic north through east, deg.
+    pub position_errors_deg: Vec<[f64; 3]>,
     /// `sun` or `jupiter` if that is within three standard deviations (and two degrees of the Sun, 0.03 of Jupiter) of a position known to
     /// six degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -130,11 +134,11 @@ impl fmt::Display for FoundBurst {
         let hz = Dimension::Frequency.show(self.frequency_hz);
         write!(f, "a burst at {hz} from {:.1} s to {:.1} s: ", self.from_s, self.until_s)?;
         write!(f, "{:.2e} Jy, {:.0} sigma", self.flux_jy, self.significance)?;
-        if let Some([longitude, latitude]) = self.positions_deg.first() {
-            let sigma = self.position_sigma_deg;
+        let first = self.positions_deg.first().zip(self.position_errors_deg.first());
+        if let Some(([longitude, latitude], [longer, shorter, _])) = first {
             write!(
                 f,
-                ", from ecliptic longitude {longitude:.2}, latitude {latitude:.2} deg (+- {sigma:.2})"
+                ", from ecliptic longitude {longitude:.2}, latitude {latitude:.2} deg (+- {longer:.2}, {shorter:.2})"
             )?;
             match self.positions_deg.len() - 1 {
                 0 => {}
