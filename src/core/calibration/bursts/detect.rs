@@ -23,7 +23,7 @@ use super::flux::{Flux, Place};
 use super::locate::{Sample, locate};
 use super::peel::BurstRow;
 use super::refine::{name, refine};
-use super::{BurstChoice, FoundBurst, LightCurve};
+use super::{BurstChoice, BurstSearch, FoundBurst, LightCurve};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::{median, percentiles};
 use crate::response::pixel::PairGeometry;
@@ -70,19 +70,8 @@ const SAMPLES_OF_PAIR: usize = 2;
 /// Limit of the number of bins. Time tags are untrusted.
 const BINS_MAX: f64 = 1e5;
 
-/// What a search knows besides the visibilities.
-#[derive(Clone, Copy, Debug)]
-pub struct BurstSearch {
-    /// Radius of the Moon, m.
-    pub moon_radius_m: f64,
-    /// Epoch of the mission, TAI seconds since 1958-01-01.
-    pub epoch_tai_s: f64,
-    /// What is done with bursts: light curves are fitted only for [`BurstChoice::Peel`].
-    pub choice: BurstChoice,
-}
-
 /// A visibility of a pair.
-struct Entry<'a> {
+pub(super) struct Entry<'a> {
     block: &'a PlacedVisibilities,
     k: usize,
     /// Its squared modulus over the upper quartile of its pair.
@@ -94,6 +83,10 @@ struct Entry<'a> {
 }
 
 impl Entry<'_> {
+    pub(super) fn pair(&self) -> Pair {
+        self.block.pair
+    }
+
     fn time_s(&self) -> f64 {
         self.block.time_s[self.k]
     }
@@ -102,27 +95,26 @@ impl Entry<'_> {
 /// Finds the bursts in the visibilities of a pass in one channel.
 #[must_use]
 pub fn find_bursts(search: BurstSearch, blocks: &[&PlacedVisibilities]) -> Vec<FoundBurst> {
+    let pairs = pairs_of(blocks, VISIBILITIES_MIN);
+    let Some(bins) = Bins::new(&pairs) else { return Vec::new() };
+    bins.detections().into_iter().filter_map(|range| describe(search, &bins, range, &pairs)).collect()
+}
+
+/// The visibilities of each pair and band that has some number of them.
+pub(super) fn pairs_of<'a>(blocks: &[&'a PlacedVisibilities], least: usize) -> Vec<Vec<Entry<'a>>> {
     let mut pairs: BTreeMap<(Pair, u16), Vec<&PlacedVisibilities>> = BTreeMap::new();
     for block in blocks {
         pairs.entry((block.pair, block.band)).or_default().push(block);
     }
-    let pairs: Vec<Vec<Entry>> = pairs.into_values().filter_map(|blocks| entries_of(&blocks)).collect();
-    let Some(bins) = Bins::new(&pairs) else { return Vec::new() };
-    let (mut found, mut next) = (Vec::new(), 0);
-    while let Some(seed) = (next..bins.ratios.len()).find(|&bin| bins.is_detection(bin)) {
-        let range = bins.extent(seed, next);
-        next = range.end;
-        found.extend(describe(search, &bins, range, &pairs));
-    }
-    found
+    pairs.into_values().filter_map(|blocks| entries_of(&blocks, least)).collect()
 }
 
 /// The visibilities of a pair; `None` if they are too few, or mostly zero.
-fn entries_of<'a>(blocks: &[&'a PlacedVisibilities]) -> Option<Vec<Entry<'a>>> {
+fn entries_of<'a>(blocks: &[&'a PlacedVisibilities], least: usize) -> Option<Vec<Entry<'a>>> {
     let all = || blocks.iter().flat_map(|&block| (0..block.len()).map(move |k| (block, k)));
     let square = |(block, k): (&PlacedVisibilities, usize)| block.value_k_sr[k].norm_sqr();
     let squares: Vec<f64> = all().map(square).filter(|square| square.is_finite()).collect();
-    if squares.len() < VISIBILITIES_MIN {
+    if squares.len() < least {
         return None;
     }
     let (middle, quartile) = percentiles(squares, 50.0, 75.0)?;
@@ -144,9 +136,9 @@ fn entries_of<'a>(blocks: &[&'a PlacedVisibilities]) -> Option<Vec<Entry<'a>>> {
 }
 
 /// The statistics by time.
-struct Bins {
+pub(super) struct Bins {
     first_s: f64,
-    width_s: f64,
+    pub(super) width_s: f64,
     /// Median over pairs of the mean ratio; 0 in a bin of too few pairs.
     ratios: Vec<f64>,
     /// Rise of the powers; 0 in a bin of too few pairs, and at the ends.
@@ -157,7 +149,7 @@ struct Bins {
 
 impl Bins {
     /// `None` if the visibilities are too few or too sparse.
-    fn new(pairs: &[Vec<Entry>]) -> Option<Self> {
+    pub(super) fn new(pairs: &[Vec<Entry>]) -> Option<Self> {
         let times_s = || pairs.iter().flatten().map(Entry::time_s);
         let (first_s, last_s) =
             times_s().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t_s| (a.min(t_s), b.max(t_s)));
@@ -219,6 +211,17 @@ impl Bins {
         (0..powers.len()).map(|bin| rise(bin).unwrap_or(0.0)).collect()
     }
 
+    /// The bins of each burst.
+    pub(super) fn detections(&self) -> Vec<Range<usize>> {
+        let (mut found, mut next) = (Vec::new(), 0);
+        while let Some(seed) = (next..self.ratios.len()).find(|&bin| self.is_detection(bin)) {
+            let range = self.extent(seed, next);
+            next = range.end;
+            found.push(range);
+        }
+        found
+    }
+
     fn is_detection(&self, bin: usize) -> bool {
         self.ratios[bin] > RATIO || self.rises[bin] > self.limits[0]
     }
@@ -227,7 +230,7 @@ impl Bins {
         ((time_s - self.first_s) / self.width_s) as usize
     }
 
-    fn start_s(&self, bin: usize) -> f64 {
+    pub(super) fn start_s(&self, bin: usize) -> f64 {
         self.first_s + self.width_s * bin as f64
     }
 
@@ -250,7 +253,7 @@ impl Bins {
     }
 
     /// Bins of a range, the brightest first: by what shows the burst, and visibilities before powers, as they have the position.
-    fn brightest(&self, range: Range<usize>) -> Vec<usize> {
+    pub(super) fn brightest(&self, range: Range<usize>) -> Vec<usize> {
         let is_visible = self.ratios[range.clone()].iter().any(|ratio| *ratio > RATIO);
         let by = if is_visible { &self.ratios } else { &self.rises };
         let mut bins: Vec<usize> = range.filter(|bin| by[*bin] > 0.0).collect();
@@ -392,7 +395,8 @@ mod tests {
                 ..PlacedVisibilities::default()
             };
             let blocks: Vec<PlacedVisibilities> = all_pairs(8).into_iter().map(&mut block).collect();
-            let pairs: Vec<Vec<Entry>> = blocks.iter().filter_map(|block| entries_of(&[block])).collect();
+            let pairs: Vec<Vec<Entry>> =
+                blocks.iter().filter_map(|block| entries_of(&[block], VISIBILITIES_MIN)).collect();
             let ratios = Bins::new(&pairs).unwrap().ratios;
             above += ratios.iter().filter(|ratio| **ratio > 0.75).count();
             all += ratios.len();

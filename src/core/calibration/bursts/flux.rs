@@ -7,7 +7,7 @@
 //! Simulations that do not smear integrations have the phase of the middle.
 
 use std::collections::BTreeMap;
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
 use num_complex::Complex64;
 
@@ -159,7 +159,11 @@ impl Flux {
             return None;
         }
         let rate = if smears { dot(motion(block, k), hat) } else { 0.0 };
-        let factor = |(cell, share, after_s): (usize, f64, f64)| (cell, share * phasor(-rate * after_s));
+        // A cell averages the fringe over its part of the integration.
+        let duration_s = row.duration_s();
+        let factor = |(cell, share, after_s): (usize, f64, f64)| {
+            (cell, share * sinc(PI * rate * share * duration_s) * phasor(-rate * after_s))
+        };
         Some(Term { turns: dot(baseline(block, k), hat), cells: self.shares(row).map(factor).collect() })
     }
 
@@ -237,6 +241,11 @@ impl Term {
     fn value(&self, row: &BurstRow) -> Complex64 {
         row.block.value_k_sr[row.k] * phasor(self.turns)
     }
+}
+
+/// `sin(x) / x`.
+pub(super) fn sinc(x: f64) -> f64 {
+    if x.abs() < 1e-6 { 1.0 } else { x.sin() / x }
 }
 
 /// `exp(2 pi i turns)`.

@@ -4,12 +4,14 @@
 //! visibilities that arrive later out as well.
 
 mod detect;
+mod early;
 mod flux;
 mod locate;
 mod peel;
 mod refine;
 
-pub use detect::{BurstSearch, find_bursts};
+pub use detect::find_bursts;
+pub use early::{BurstAlert, find_alerts};
 pub(super) use locate::{Sample, locate};
 pub use peel::LightCurve;
 
@@ -52,6 +54,17 @@ impl BurstChoice {
     pub(super) fn is_off(&self) -> bool {
         *self == Self::Off
     }
+}
+
+/// What a search knows besides the visibilities.
+#[derive(Clone, Copy, Debug)]
+pub struct BurstSearch {
+    /// Radius of the Moon, m.
+    pub moon_radius_m: f64,
+    /// Epoch of the mission, TAI seconds since 1958-01-01.
+    pub epoch_tai_s: f64,
+    /// What is done with bursts: light curves are fitted only for [`BurstChoice::Peel`].
+    pub choice: BurstChoice,
 }
 
 /// A burst in one channel.
@@ -269,6 +282,8 @@ struct BurstTable {
     longest_s: f64,
     /// Memory of all light curves.
     curves_bytes: usize,
+    /// Alerts of this session, before their passes ended.
+    alerts: Vec<BurstAlert>,
 }
 
 impl BurstTable {
@@ -284,6 +299,13 @@ impl BurstTable {
         let at = starts.partition_point(|(from_s, _)| *from_s <= burst.from_s);
         starts.insert(at, (burst.from_s, self.bursts.len()));
         self.bursts.push(burst);
+    }
+
+    /// Whether a burst of a channel has a time in it.
+    fn knows(&self, channel: u16, peak_s: f64) -> bool {
+        let starts = self.starts.get(&channel).map(Vec::as_slice).unwrap_or_default();
+        let until = starts.partition_point(|(from_s, _)| *from_s <= peak_s);
+        starts[..until].iter().any(|(_, index)| self.bursts[*index].until_s > peak_s)
     }
 
     /// The bursts in the time of a block, and perhaps some beside it, without the first `known`, in the order in which they were found.
@@ -329,13 +351,31 @@ impl FoundBursts {
         has_room
     }
 
+    /// Adds an alert, unless there is one of its time, or a burst.
+    pub fn alert(&self, alert: BurstAlert) {
+        let mut table = self.table();
+        let is_known = table.alerts.iter().any(|other| other.is_same_as(&alert));
+        if !is_known && !table.knows(alert.channel, alert.peak_s) && table.alerts.len() < BURSTS_MAX {
+            table.alerts.push(alert);
+        }
+    }
+
+    /// Alerts of this session, except the first `seen`.
+    #[must_use]
+    pub fn alerts_since(&self, seen: usize) -> Vec<BurstAlert> {
+        self.table().alerts.get(seen..).unwrap_or_default().to_vec()
+    }
+
+    /// Number of alerts of this session.
+    #[must_use]
+    pub fn alerts(&self) -> usize {
+        self.table().alerts.len()
+    }
+
     /// Whether a burst of the table has the peak of another in its time. What was subtracted leaves its power in the weights.
     #[must_use]
     pub fn knows(&self, burst: &FoundBurst) -> bool {
-        let table = self.table();
-        let starts = table.starts.get(&burst.channel).map(Vec::as_slice).unwrap_or_default();
-        let until = starts.partition_point(|(from_s, _)| *from_s <= burst.peak_s);
-        starts[..until].iter().any(|(_, index)| table.bursts[*index].until_s > burst.peak_s)
+        self.table().knows(burst.channel, burst.peak_s)
     }
 
     /// Whether a burst is subtracted from visibilities of a channel in a span of time.

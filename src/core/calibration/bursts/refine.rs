@@ -16,8 +16,8 @@ use std::ops::Range;
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::detect::BurstSearch;
-use super::flux::{Flux, Place, Seen, baseline, phasor};
+use super::BurstSearch;
+use super::flux::{Flux, Place, Seen, baseline, phasor, sinc};
 use super::locate::Candidate;
 use super::peel::BurstRow;
 use crate::array::{jupiter_hat_by_date, sun_hat_by_date};
@@ -263,8 +263,7 @@ fn information(rows: &[BurstRow]) -> Vec<f64> {
 
 /// Correlation of an even sky's visibilities, whose baselines differ by some wavelengths.
 fn correlation(wavelengths: f64) -> f64 {
-    let x = TAU * wavelengths;
-    if x < 1e-6 { 1.0 } else { x.sin() / x }
+    sinc(TAU * wavelengths)
 }
 
 /// What the visibilities say about a direction: the inverse of its information, the variance of the scores, and the chi-square per degree of
