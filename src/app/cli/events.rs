@@ -155,7 +155,7 @@ enum Entry<'a> {
     },
     /// A burst of a point source, found in a pass that has ended.
     Burst {
-        what: FoundBurst,
+        what: Box<FoundBurst>,
     },
     /// There may be a burst in a pass that goes on.
     BurstAlert {

@@ -67,7 +67,7 @@ pub(crate) enum Change {
     /// The solver found a change of the instrument.
     Instrument(InstrumentEvent),
     /// A burst was found.
-    Burst(FoundBurst),
+    Burst(Box<FoundBurst>),
     /// There may be a burst in a pass that goes on.
     BurstAlert(BurstAlert),
     /// Products begin to fail to be written, or are written again.
@@ -113,7 +113,7 @@ impl RunChanges {
             let alerts = ground.bursts.alerts_since(self.alerts);
             self.alerts += alerts.len();
             found.extend(alerts.into_iter().map(Change::BurstAlert));
-            found.extend(bursts.into_iter().map(Change::Burst));
+            found.extend(bursts.into_iter().map(Box::new).map(Change::Burst));
         }
         let products = view.products.as_ref().and_then(|products| products.report().unwritten);
         if fails_or_recovers(&mut self.products, &products) {

@@ -363,7 +363,7 @@ fn samples_of(pair: &[Entry], is_in: impl Fn(f64) -> bool) -> Vec<Sample> {
         };
         let variance_k2_sr2 = kept * steady_k2_sr2 + 2.0 / block.weight[k];
         let (value_k_sr, information) = (block.value_k_sr[k], variance_k2_sr2.recip());
-        Sample { geometry, value_k_sr, information, template: 1.0 }
+        Sample { geometry, value_k_sr, information }
     };
     inside.iter().step_by(step).map(sample).collect()
 }

@@ -3,7 +3,6 @@
 //! The model of a visibility is P_b exp(-2 pi i u . n), with a positive power for each bin of time, or 0 where the Moon hides n from a
 //! daughter. The rest is noise: thermal, and of the steady sky. With the best powers, twice the logarithm of the likelihood over that of no
 //! source is `sum over b of 2 C^2 / I`, C the real part of the sum of V exp(2 pi i u . n) over variances, I the sum of inverse variances.
-//! Where the power is known to change within a bin, each visibility has its part of P_b in both.
 //!
 //! Baselines reach from some wavelengths to thousands, and daughters that follow each other lie nearly in a line: the cosine of the angle
 //! from the line is known a thousand times better than the angle about it. The search goes over these two, first with the short
@@ -49,8 +48,6 @@ pub(in crate::calibration) struct Sample {
     pub(in crate::calibration) value_k_sr: Complex64,
     /// Inverse variance of the visibility, real and imaginary part together.
     pub(in crate::calibration) information: f64,
-    /// Power of the source in units of that of its bin.
-    pub(in crate::calibration) template: f64,
 }
 
 /// A direction in which a source may be.
@@ -83,14 +80,6 @@ struct Place {
 pub(in crate::calibration) fn locate(bins: &[Vec<Sample>], moon_radius_m: f64) -> Vec<Candidate> {
     let Some(search) = Search::new(bins, moon_radius_m) else { return Vec::new() };
     search.all_sky().iter().map(|place| search.candidate(place)).collect()
-}
-
-/// The peak of the likelihood near a direction: within a fringe of the longest baseline.
-pub(super) fn refined(samples: &[Vec<Sample>], moon_radius_m: f64, hat: Vec3) -> Option<Candidate> {
-    let search = Search::new(samples, moon_radius_m)?;
-    let longest = search.lengths().last().copied()?.max(FIRST_WAVELENGTHS);
-    let place = search.polished(search.place(hat), search.steps(longest));
-    Some(search.candidate(&place))
 }
 
 impl Sample {
@@ -134,11 +123,6 @@ impl<'a> Search<'a> {
         let sine = (1.0 - cosine * cosine).max(0.0).sqrt();
         let (sin, cos) = place.turn.sin_cos();
         add(scale(cosine, along), add(scale(sine * cos, a), scale(sine * sin, b)))
-    }
-
-    fn place(&self, hat: Vec3) -> Place {
-        let [cosine, x, y] = self.axes.map(|axis| dot(axis, hat));
-        Place { cosine, turn: y.atan2(x), twice_log: 0.0 }
     }
 
     fn candidate(&self, place: &Place) -> Candidate {
@@ -213,15 +197,15 @@ impl<'a> Search<'a> {
     fn sums(&self, bin: usize, n_hat: Vec3, reach: f64) -> [f64; 2] {
         let mut sums = [0.0; 2];
         for (sample, u, length) in &self.bins[bin] {
-            let Sample { geometry, value_k_sr, information, template } = sample;
+            let Sample { geometry, value_k_sr, information } = sample;
             let is_hidden = |r_m| hidden_by_moon(r_m, n_hat, self.moon_radius_m);
             if *length > reach || is_hidden(geometry.r_i_m) || is_hidden(geometry.r_j_m) {
                 continue;
             }
             let turns = dot(*u, n_hat);
             let (sin, cos) = (TAU * (turns - turns.round())).sin_cos();
-            sums[0] += information * template * (value_k_sr.re * cos - value_k_sr.im * sin);
-            sums[1] += information * template * template;
+            sums[0] += information * (value_k_sr.re * cos - value_k_sr.im * sin);
+            sums[1] += information;
         }
         sums
     }

@@ -208,7 +208,6 @@ fn source(pairs: &[Vec<Datum>]) -> Option<ModelFault> {
             geometry: datum.geometry,
             value_k_sr: datum.value_k_sr / factor - datum.model,
             information: 0.5 * datum.weight * factor.norm_sqr(),
-            template: 1.0,
         };
         let is_known = factor.norm_sqr() > 0.0;
         thinned(pair, OF_PAIR).into_iter().filter(|_| is_known).map(sample).collect()
