@@ -16,8 +16,8 @@ use serde_json::json;
 use super::arguments::output_or_standard;
 use super::log::{Level, is_json, log_json, note, say, say_entry};
 use super::output::{CommandError, cannot_write, json_text, print_notes};
-use crate::calibration::FoundBurst;
 use crate::calibration::solver::InstrumentEvent;
+use crate::calibration::{BurstAlert, FoundBurst};
 use crate::downlink::ReceptionCounters;
 use crate::files::{ProtectedInputs, growing_file, is_same_name};
 use crate::frames::VisibilityReason;
@@ -166,7 +166,11 @@ enum Entry<'a> {
     },
     /// A burst of a point source, found in a pass that has ended.
     Burst {
-        what: FoundBurst,
+        what: Box<FoundBurst>,
+    },
+    /// There may be a burst in a pass that goes on.
+    BurstAlert {
+        what: BurstAlert,
     },
     End(&'a End),
 }
@@ -408,6 +412,7 @@ impl<'a> Entry<'a> {
             Change::Saving { now, .. } => Self::Checkpoint { saving: now.clone() },
             Change::Instrument(what) => Self::Instrument { what: what.clone() },
             Change::Burst(what) => Self::Burst { what: what.clone() },
+            Change::BurstAlert(what) => Self::BurstAlert { what: what.clone() },
             Change::Products(_) | Change::Archive(_) => return None,
         })
     }
@@ -441,6 +446,7 @@ pub(super) fn log_change(change: &Change) {
         Change::Saving { before, now } => log_saving(before, now),
         Change::Instrument(what) => say("instrument", &json!({ "what": what }), what),
         Change::Burst(what) => say("burst", &json!({ "what": what }), what),
+        Change::BurstAlert(what) => say("burst-alert", &json!({ "what": what }), what),
         Change::Products(now) => log_failure_change("products", "maps", now.as_ref()),
         Change::Archive(now) => {
             log_failure_change("archive", "the raw archive, and nothing is taken: packets", now.as_ref());

@@ -264,6 +264,9 @@ impl Console {
             bursts: ground
                 .filter(|ground| ground.bursts.choice() != BurstChoice::Off)
                 .map(|ground| ground.bursts.len() as u64),
+            burst_alerts: ground
+                .filter(|ground| ground.bursts.choice() != BurstChoice::Off)
+                .map(|ground| ground.bursts.alerts() as u64),
             waiting_bytes: ground.map(|ground| ground.waiting_bytes.load(Ordering::Relaxed)),
             listening,
             saving: view.and_then(RunView::saving),
@@ -313,6 +316,7 @@ fn event_of(change: &Change) -> Option<(bool, String)> {
             .then(|| (false, format!("checkpoint {} of this session is written", now.written))),
         Change::Instrument(_) => None,
         Change::Burst(burst) => Some((false, burst.to_string())),
+        Change::BurstAlert(alert) => Some((false, alert.to_string())),
         Change::Products(now) => Some(failure_change("maps", now.as_ref())),
         Change::Archive(now) => Some(failure_change("the raw archive", now.as_ref())),
     }

@@ -204,6 +204,10 @@ impl Scrape {
             let about = "Bursts of point sources found, counted in each channel";
             counter(out, MetricInfo("bursts", about, None), bursts)?;
         }
+        if let Some(alerts) = self.status.burst_alerts {
+            let about = "Alerts of bursts before their passes ended, in this session";
+            counter(out, MetricInfo("burst_alerts", about, None), alerts)?;
+        }
         self.saving(out)?;
         let Some(products) = &self.status.products else { return Ok(()) };
         let about = "Attempts to write maps and pictures that failed";

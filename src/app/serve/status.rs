@@ -189,6 +189,9 @@ pub(super) struct Status {
     /// Number of bursts of point sources found, in any session; `None` where they are not looked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) bursts: Option<u64>,
+    /// Number of alerts of bursts before their passes ended, in this session.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) burst_alerts: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) listening: Option<ListenerStatus>,
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -29,7 +29,8 @@ pub use autos::{AUTOS_MAX, AutoTable};
 pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 #[doc(hidden)]
 pub use bursts::{
-    BurstChoice, BurstSearch, BurstSummary, DividedBlock, FoundBurst, FoundBursts, LightCurve, find_bursts,
+    BurstAlert, BurstChoice, BurstSearch, BurstSummary, DividedBlock, FoundBurst, FoundBursts, LightCurve,
+    find_alerts, find_bursts,
 };
 #[doc(hidden)]
 pub use config::{CalibrationConfig, CalibrationHook};

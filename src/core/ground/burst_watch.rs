@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::mem;
 
 use super::DeliveredPacket;
-use crate::calibration::{BurstSearch, FoundBurst, FoundBursts, find_bursts};
+use crate::calibration::{BurstSearch, FoundBurst, FoundBursts, find_alerts, find_bursts};
 use crate::downlink::receive::SendingKey;
 use crate::frames::{PlacedFrame, PlacedVisibilities};
 use crate::units::ChannelId;
@@ -20,6 +20,10 @@ const GAP_S: f64 = 600.0;
 /// judged without the rest.
 const VISIBILITIES_MAX: usize = 1 << 18;
 
+/// Part by which the visibilities of a channel grow between searches of an open pass while data arrive without pause: all searches of a pass
+/// take as long as some nine of all of it.
+const GROWTH: f64 = 1.0 / 8.0;
+
 /// A block of visibilities, and the packet that brought it.
 pub(super) struct WatchedBlock {
     pub(super) placed: PlacedVisibilities,
@@ -28,10 +32,19 @@ pub(super) struct WatchedBlock {
     pub(super) is_used: bool,
 }
 
+/// The visibilities of the open pass in a channel.
+#[derive(Default)]
+struct WatchedChannel {
+    blocks: Vec<WatchedBlock>,
+    visibilities: usize,
+    /// How many of them there were at the last search.
+    searched: usize,
+}
+
 /// The visibilities of the open pass, by channel.
 #[derive(Default)]
 pub(super) struct BurstWatch {
-    channels: BTreeMap<ChannelId, Vec<WatchedBlock>>,
+    channels: BTreeMap<ChannelId, WatchedChannel>,
     span_s: Option<[f64; 2]>,
     visibilities: usize,
 }
@@ -59,14 +72,28 @@ impl BurstWatch {
         self.span_s = Some([from_s.min(first), until_s.max(last)]);
         self.visibilities += placed.len();
         let sent = packets.first().map(|packet| (packet.header.time, packet.header.count));
-        self.channels.entry(placed.channel).or_default().push(WatchedBlock { placed, sent, is_used });
+        let channel = self.channels.entry(placed.channel).or_default();
+        channel.visibilities += placed.len();
+        channel.blocks.push(WatchedBlock { placed, sent, is_used });
+    }
+
+    /// Searches channels of the open pass: those that have grown enough, or, while nothing else waits, those that have grown.
+    pub(super) fn alert(&mut self, bursts: &FoundBursts, is_idle: bool) {
+        for channel in self.channels.values_mut() {
+            let new = channel.visibilities - channel.searched;
+            if new > 0 && (is_idle || new as f64 > GROWTH * channel.searched as f64) {
+                channel.searched = channel.visibilities;
+                let placed: Vec<_> = channel.blocks.iter().map(|block| &block.placed).collect();
+                find_alerts(&placed).into_iter().for_each(|alert| bursts.alert(alert));
+            }
+        }
     }
 
     /// Ends the open pass: adds its bursts to a table, and returns the blocks of channels with bursts.
     pub(super) fn end(&mut self, search: BurstSearch, bursts: &FoundBursts) -> Vec<WatchedBlock> {
         let Self { channels, .. } = mem::take(self);
         let mut disturbed = Vec::new();
-        for blocks in channels.into_values() {
+        for WatchedChannel { blocks, .. } in channels.into_values() {
             let placed: Vec<&PlacedVisibilities> = blocks.iter().map(|block| &block.placed).collect();
             let mut found: Vec<FoundBurst> = find_bursts(search, &placed);
             // By a session that had the first visibilities of the pass.

@@ -314,6 +314,7 @@ impl Ground {
             draft.used_span_s = self.accumulator.accept(placed, out)?;
             if let Some(watched) = watched {
                 self.burst_watch.keep(watched, packets, draft.used_span_s.is_some());
+                self.burst_watch.alert(&self.outcome.bursts, false);
             }
         }
         if let Some(archive) = &mut self.archive {
@@ -499,6 +500,7 @@ impl Stage for Ground {
     }
 
     fn idle(&mut self) {
+        self.burst_watch.alert(&self.outcome.bursts, true);
         self.show(Activity::Idle);
     }
 

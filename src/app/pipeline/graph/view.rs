@@ -2,8 +2,8 @@
 
 use std::sync::{Arc, PoisonError};
 
-use crate::calibration::FoundBurst;
 use crate::calibration::solver::InstrumentEvent;
+use crate::calibration::{BurstAlert, FoundBurst};
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
 use crate::downlink::transport::socket::Listening;
@@ -67,7 +67,9 @@ pub(crate) enum Change {
     /// The solver found a change of the instrument.
     Instrument(InstrumentEvent),
     /// A burst was found.
-    Burst(FoundBurst),
+    Burst(Box<FoundBurst>),
+    /// There may be a burst in a pass that goes on.
+    BurstAlert(BurstAlert),
     /// Products begin to fail to be written, or are written again.
     Products(Option<String>),
     /// The raw archive begins to fail to be written, or is written again.
@@ -81,6 +83,7 @@ pub(crate) struct RunChanges {
     saving: SavingReport,
     instrument: usize,
     bursts: usize,
+    alerts: usize,
     products: Option<String>,
     archive: Option<String>,
 }
@@ -107,7 +110,10 @@ impl RunChanges {
             let bursts = ground.bursts.since(self.bursts);
             (self.instrument, self.bursts) = (self.instrument + events.len(), self.bursts + bursts.len());
             found.extend(events.into_iter().map(Change::Instrument));
-            found.extend(bursts.into_iter().map(Change::Burst));
+            let alerts = ground.bursts.alerts_since(self.alerts);
+            self.alerts += alerts.len();
+            found.extend(alerts.into_iter().map(Change::BurstAlert));
+            found.extend(bursts.into_iter().map(Box::new).map(Change::Burst));
         }
         let products = view.products.as_ref().and_then(|products| products.report().unwritten);
         if fails_or_recovers(&mut self.products, &products) {

@@ -19,9 +19,11 @@ use std::collections::BTreeMap;
 use std::f64::consts::LN_2;
 use std::ops::Range;
 
-use super::locate::{KnownBody, Sample, locate};
+use super::flux::{Flux, Place};
+use super::locate::{Sample, locate};
 use super::peel::BurstRow;
-use super::{BurstChoice, FoundBurst, LightCurve};
+use super::refine::{name, refine};
+use super::{BurstChoice, BurstSearch, FoundBurst, LightCurve};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::{median, percentiles};
 use crate::response::pixel::PairGeometry;
@@ -68,19 +70,8 @@ const SAMPLES_OF_PAIR: usize = 2;
 /// Limit of the number of bins. Time tags are untrusted.
 const BINS_MAX: f64 = 1e5;
 
-/// What a search knows besides the visibilities.
-#[derive(Clone, Copy, Debug)]
-pub struct BurstSearch {
-    /// Radius of the Moon, m.
-    pub moon_radius_m: f64,
-    /// Epoch of the mission, TAI seconds since 1958-01-01.
-    pub epoch_tai_s: f64,
-    /// What is done with bursts: light curves are fitted only for [`BurstChoice::Peel`].
-    pub choice: BurstChoice,
-}
-
 /// A visibility of a pair.
-struct Entry<'a> {
+pub(super) struct Entry<'a> {
     block: &'a PlacedVisibilities,
     k: usize,
     /// Its squared modulus over the upper quartile of its pair.
@@ -92,6 +83,10 @@ struct Entry<'a> {
 }
 
 impl Entry<'_> {
+    pub(super) fn pair(&self) -> Pair {
+        self.block.pair
+    }
+
     fn time_s(&self) -> f64 {
         self.block.time_s[self.k]
     }
@@ -100,27 +95,26 @@ impl Entry<'_> {
 /// Finds the bursts in the visibilities of a pass in one channel.
 #[must_use]
 pub fn find_bursts(search: BurstSearch, blocks: &[&PlacedVisibilities]) -> Vec<FoundBurst> {
+    let pairs = pairs_of(blocks, VISIBILITIES_MIN);
+    let Some(bins) = Bins::new(&pairs) else { return Vec::new() };
+    bins.detections().into_iter().filter_map(|range| describe(search, &bins, range, &pairs)).collect()
+}
+
+/// The visibilities of each pair and band that has some number of them.
+pub(super) fn pairs_of<'a>(blocks: &[&'a PlacedVisibilities], least: usize) -> Vec<Vec<Entry<'a>>> {
     let mut pairs: BTreeMap<(Pair, u16), Vec<&PlacedVisibilities>> = BTreeMap::new();
     for block in blocks {
         pairs.entry((block.pair, block.band)).or_default().push(block);
     }
-    let pairs: Vec<Vec<Entry>> = pairs.into_values().filter_map(|blocks| entries_of(&blocks)).collect();
-    let Some(bins) = Bins::new(&pairs) else { return Vec::new() };
-    let (mut found, mut next) = (Vec::new(), 0);
-    while let Some(seed) = (next..bins.ratios.len()).find(|&bin| bins.is_detection(bin)) {
-        let range = bins.extent(seed, next);
-        next = range.end;
-        found.extend(describe(search, &bins, range, &pairs));
-    }
-    found
+    pairs.into_values().filter_map(|blocks| entries_of(&blocks, least)).collect()
 }
 
 /// The visibilities of a pair; `None` if they are too few, or mostly zero.
-fn entries_of<'a>(blocks: &[&'a PlacedVisibilities]) -> Option<Vec<Entry<'a>>> {
+fn entries_of<'a>(blocks: &[&'a PlacedVisibilities], least: usize) -> Option<Vec<Entry<'a>>> {
     let all = || blocks.iter().flat_map(|&block| (0..block.len()).map(move |k| (block, k)));
     let square = |(block, k): (&PlacedVisibilities, usize)| block.value_k_sr[k].norm_sqr();
     let squares: Vec<f64> = all().map(square).filter(|square| square.is_finite()).collect();
-    if squares.len() < VISIBILITIES_MIN {
+    if squares.len() < least {
         return None;
     }
     let (middle, quartile) = percentiles(squares, 50.0, 75.0)?;
@@ -142,9 +136,9 @@ fn entries_of<'a>(blocks: &[&'a PlacedVisibilities]) -> Option<Vec<Entry<'a>>> {
 }
 
 /// The statistics by time.
-struct Bins {
+pub(super) struct Bins {
     first_s: f64,
-    width_s: f64,
+    pub(super) width_s: f64,
     /// Median over pairs of the mean ratio; 0 in a bin of too few pairs.
     ratios: Vec<f64>,
     /// Rise of the powers; 0 in a bin of too few pairs, and at the ends.
@@ -155,7 +149,7 @@ struct Bins {
 
 impl Bins {
     /// `None` if the visibilities are too few or too sparse.
-    fn new(pairs: &[Vec<Entry>]) -> Option<Self> {
+    pub(super) fn new(pairs: &[Vec<Entry>]) -> Option<Self> {
         let times_s = || pairs.iter().flatten().map(Entry::time_s);
         let (first_s, last_s) =
             times_s().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t_s| (a.min(t_s), b.max(t_s)));
@@ -217,6 +211,17 @@ impl Bins {
         (0..powers.len()).map(|bin| rise(bin).unwrap_or(0.0)).collect()
     }
 
+    /// The bins of each burst.
+    pub(super) fn detections(&self) -> Vec<Range<usize>> {
+        let (mut found, mut next) = (Vec::new(), 0);
+        while let Some(seed) = (next..self.ratios.len()).find(|&bin| self.is_detection(bin)) {
+            let range = self.extent(seed, next);
+            next = range.end;
+            found.push(range);
+        }
+        found
+    }
+
     fn is_detection(&self, bin: usize) -> bool {
         self.ratios[bin] > RATIO || self.rises[bin] > self.limits[0]
     }
@@ -225,7 +230,7 @@ impl Bins {
         ((time_s - self.first_s) / self.width_s) as usize
     }
 
-    fn start_s(&self, bin: usize) -> f64 {
+    pub(super) fn start_s(&self, bin: usize) -> f64 {
         self.first_s + self.width_s * bin as f64
     }
 
@@ -248,7 +253,7 @@ impl Bins {
     }
 
     /// Bins of a range, the brightest first: by what shows the burst, and visibilities before powers, as they have the position.
-    fn brightest(&self, range: Range<usize>) -> Vec<usize> {
+    pub(super) fn brightest(&self, range: Range<usize>) -> Vec<usize> {
         let is_visible = self.ratios[range.clone()].iter().any(|ratio| *ratio > RATIO);
         let by = if is_visible { &self.ratios } else { &self.rises };
         let mut bins: Vec<usize> = range.filter(|bin| by[*bin] > 0.0).collect();
@@ -278,7 +283,7 @@ fn describe(
 ) -> Option<FoundBurst> {
     let mut brightest = bins.brightest(range.clone());
     brightest.truncate(BRIGHTEST);
-    let (peak, first) = (*brightest.first()?, pairs.first()?.first()?);
+    let (peak, block) = (*brightest.first()?, pairs.first()?.first()?.block);
     // A power for each half of a bin, as a burst may be as short as an integration, of which a bin holds two or more.
     let samples: Vec<Vec<Sample>> = brightest
         .iter()
@@ -290,27 +295,34 @@ fn describe(
         })
         .collect();
     let peak_s = bins.start_s(peak) + 0.5 * bins.width_s;
-    let located = locate(&samples, search.moon_radius_m, &KnownBody::all(search.epoch_tai_s, peak_s))?;
-    let jy = k_sr_per_jy(first.block.frequency_hz).recip();
     let span_s = [range.start, range.end].map(|bin| bins.start_s(bin));
-    let hat = located.directions.first().filter(|_| search.choice == BurstChoice::Peel);
-    let light_curve =
-        hat.and_then(|hat| LightCurve::fit(&rows_of(pairs, span_s), *hat, span_s, search.moon_radius_m));
+    let rows = rows_of(pairs, span_s);
+    let candidates = locate(&samples, search.moon_radius_m);
+    let (located, smears) = refine(search, &candidates, &rows, span_s);
+    let hat = located.first().map_or(candidates.first()?.hat, |place| place.hat);
+    let flux = Flux::fit(&rows, Place { hat, moon_radius_m: search.moon_radius_m, smears }, span_s);
+    let peak_span_s = [peak, peak + 1].map(|bin| bins.start_s(bin));
+    // Rows that determine no flux, as of one daughter behind the Moon, are a burst still.
+    let [power_k_sr, power_sigma_k_sr] = flux.map_or([0.0; 2], |flux| flux.mean_k_sr(&rows, peak_span_s));
+    let jy = k_sr_per_jy(block.frequency_hz).recip();
+    let is_peeled = search.choice == BurstChoice::Peel;
+    let fit = || LightCurve::fit(&rows, hat, span_s, search.moon_radius_m);
     Some(FoundBurst {
-        channel: first.block.channel.0,
-        frequency_hz: first.block.frequency_hz,
+        channel: block.channel.0,
+        frequency_hz: block.frequency_hz,
         from_s: span_s[0],
         until_s: span_s[1],
         peak_s,
-        significance: located.significance,
-        flux_jy: jy * located.power_k_sr,
-        flux_sigma_jy: jy * located.power_sigma_k_sr,
-        positions_deg: located.directions.iter().map(|hat| ecliptic_deg(*hat)).collect(),
-        position_sigma_deg: located.sigma_rad.to_degrees(),
-        name: located.name.map(str::to_owned),
+        peak_span_s,
+        significance: candidates.first()?.twice_log.max(0.0).sqrt(),
+        flux_jy: jy * power_k_sr,
+        flux_sigma_jy: jy * power_sigma_k_sr,
+        positions_deg: located.iter().map(|place| ecliptic_deg(place.hat)).collect(),
+        position_errors_deg: located.iter().map(|place| place.errors_rad.map(f64::to_degrees)).collect(),
+        name: name(search, peak_s, &located).map(str::to_owned),
         seen_from_m: seen_from_m(pairs, span_s),
         moon_radius_m: search.moon_radius_m,
-        light_curve,
+        light_curve: if is_peeled { fit() } else { None },
     })
 }
 
@@ -350,7 +362,8 @@ fn samples_of(pair: &[Entry], is_in: impl Fn(f64) -> bool) -> Vec<Sample> {
             response: AntennaResponse::Isotropic,
         };
         let variance_k2_sr2 = kept * steady_k2_sr2 + 2.0 / block.weight[k];
-        Sample { geometry, value_k_sr: block.value_k_sr[k], information: variance_k2_sr2.recip() }
+        let (value_k_sr, information) = (block.value_k_sr[k], variance_k2_sr2.recip());
+        Sample { geometry, value_k_sr, information }
     };
     inside.iter().step_by(step).map(sample).collect()
 }
@@ -382,7 +395,8 @@ mod tests {
                 ..PlacedVisibilities::default()
             };
             let blocks: Vec<PlacedVisibilities> = all_pairs(8).into_iter().map(&mut block).collect();
-            let pairs: Vec<Vec<Entry>> = blocks.iter().filter_map(|block| entries_of(&[block])).collect();
+            let pairs: Vec<Vec<Entry>> =
+                blocks.iter().filter_map(|block| entries_of(&[block], VISIBILITIES_MIN)).collect();
             let ratios = Bins::new(&pairs).unwrap().ratios;
             above += ratios.iter().filter(|ratio| **ratio > 0.75).count();
             all += ratios.len();

@@ -13,9 +13,9 @@ use std::f64::consts::{PI, TAU};
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use crate::array::{hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
+use crate::array::hidden_by_moon;
 use crate::response::pixel::PairGeometry;
-use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};
+use crate::units::vector::{Vec3, add, cross, dot, norm, scale, unit};
 
 /// Least reach of the first grid, wavelengths.
 const FIRST_WAVELENGTHS: f64 = 8.0;
@@ -36,24 +36,10 @@ const TURN_MAX: f64 = TAU / 12.0;
 const KEPT: usize = 96;
 
 /// Directions that are refined to the peak of the likelihood.
-const POLISHED: usize = 8;
+const POLISHED: usize = 24;
 
 /// Halvings of the steps of this refinement: to 1e-5 of a fringe.
 const HALVINGS: usize = 15;
-
-/// Distance from the Sun within which its bursts at these frequencies arise and are scattered, rad: two degrees.
-const SUN_RAD: f64 = 0.035;
-/// The error of Jupiter's direction, rad.
-const JUPITER_RAD: f64 = 5e-4;
-
-/// Standard deviation of a position, rad, up to which it can have a name. On short baselines along a line it is any place of a circle.
-const SIGMA_RAD_MAX: f64 = 0.1;
-
-/// Directions of equal likelihood that are reported.
-const REPORTED_MAX: usize = 4;
-
-/// Twice the logarithm of a likelihood, with the scatter found, within which 99 % of positions, of two parameters, lie.
-const WITHIN: f64 = 9.21;
 
 /// A visibility for the search.
 #[derive(Clone, Copy, Debug)]
@@ -64,38 +50,14 @@ pub(in crate::calibration) struct Sample {
     pub(in crate::calibration) information: f64,
 }
 
-/// A body that a source may be.
-pub(in crate::calibration) struct KnownBody {
-    pub(in crate::calibration) name: &'static str,
-    /// Direction from the Moon.
+/// A direction in which a source may be.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::calibration) struct Candidate {
     pub(in crate::calibration) hat: Vec3,
-    /// How far from its centre bursts may be, rad.
-    pub(in crate::calibration) radius_rad: f64,
-}
-
-impl KnownBody {
-    /// The Sun and Jupiter some seconds after a mission's epoch.
-    pub(in crate::calibration) fn all(epoch_tai_s: f64, t_s: f64) -> [Self; 2] {
-        [
-            Self { name: "sun", hat: sun_hat_by_date(epoch_tai_s, t_s), radius_rad: SUN_RAD },
-            Self { name: "jupiter", hat: jupiter_hat_by_date(epoch_tai_s, t_s), radius_rad: JUPITER_RAD },
-        ]
-    }
-}
-
-/// A located source.
-#[derive(Clone, Debug)]
-pub(in crate::calibration) struct Located {
-    /// The likeliest direction first.
-    pub(in crate::calibration) directions: Vec<Vec3>,
-    /// Standard deviation of the first direction along its worst axis, rad.
-    pub(in crate::calibration) sigma_rad: f64,
-    pub(in crate::calibration) significance: f64,
-    /// Power in the bin where it is most significant, and its standard deviation, K sr.
+    /// Twice the logarithm of the likelihood over that of no source.
+    pub(in crate::calibration) twice_log: f64,
+    /// Power in the bin where it is most significant, K sr; 0 if no bin sees it.
     pub(in crate::calibration) power_k_sr: f64,
-    pub(in crate::calibration) power_sigma_k_sr: f64,
-    /// The body that may be at one of the directions.
-    pub(in crate::calibration) name: Option<&'static str>,
 }
 
 /// Samples of a bin with their baselines in wavelengths.
@@ -114,35 +76,10 @@ struct Place {
     twice_log: f64,
 }
 
-/// Finds the direction of a source, whose power may differ from bin to bin. `None` without samples.
-pub(in crate::calibration) fn locate(
-    bins: &[Vec<Sample>],
-    moon_radius_m: f64,
-    bodies: &[KnownBody],
-) -> Option<Located> {
-    let search = Search::new(bins, moon_radius_m)?;
-    let best = search.all_sky();
-    let (largest, longest) = (best.first()?.twice_log, search.lengths().last().copied()?.max(1.0));
-    let first = search.direction(best.first()?);
-    let scatter = search.scatter(first);
-    let sigma_rad = scatter * search.information(first, longest).sqrt().recip();
-    let [power_k_sr, power_sigma_k_sr] = search.power(first)?;
-    let mut directions: Vec<Vec3> = Vec::new();
-    let apart = |a: Vec3, b: Vec3| norm(sub(a, b));
-    for place in best.iter().filter(|place| largest - place.twice_log < WITHIN * scatter * scatter) {
-        let hat = search.direction(place);
-        let is_other = directions.iter().all(|other| apart(*other, hat) > 5.0 * sigma_rad + longest.recip());
-        if is_other && directions.len() < REPORTED_MAX {
-            directions.push(hat);
-        }
-    }
-    let is_at = |body: &&KnownBody| {
-        let within_rad = body.radius_rad + WITHIN.sqrt() * sigma_rad;
-        directions.iter().any(|hat| apart(*hat, body.hat) < within_rad)
-    };
-    let name = bodies.iter().find(is_at).filter(|_| sigma_rad < SIGMA_RAD_MAX).map(|body| body.name);
-    let significance = largest.max(0.0).sqrt();
-    Some(Located { directions, sigma_rad, significance, power_k_sr, power_sigma_k_sr, name })
+/// Finds directions of a source, whose power may differ from bin to bin, the likeliest first. None without samples.
+pub(in crate::calibration) fn locate(bins: &[Vec<Sample>], moon_radius_m: f64) -> Vec<Candidate> {
+    let Some(search) = Search::new(bins, moon_radius_m) else { return Vec::new() };
+    search.all_sky().iter().map(|place| search.candidate(place)).collect()
 }
 
 impl Sample {
@@ -186,6 +123,12 @@ impl<'a> Search<'a> {
         let sine = (1.0 - cosine * cosine).max(0.0).sqrt();
         let (sin, cos) = place.turn.sin_cos();
         add(scale(cosine, along), add(scale(sine * cos, a), scale(sine * sin, b)))
+    }
+
+    fn candidate(&self, place: &Place) -> Candidate {
+        let hat = self.direction(place);
+        let power_k_sr = self.power(hat).unwrap_or(0.0);
+        Candidate { hat, twice_log: place.twice_log, power_k_sr }
     }
 
     /// The best places of the sky, the likeliest first.
@@ -250,12 +193,12 @@ impl<'a> Search<'a> {
         best
     }
 
-    /// Sums of a bin in a direction, over baselines of at most `reach` wavelengths whose daughters see the direction `sight`: C and I.
-    fn sums(&self, bin: usize, [n_hat, sight]: [Vec3; 2], reach: f64) -> [f64; 2] {
+    /// Sums of a bin in a direction, over baselines of at most `reach` wavelengths whose daughters see it: C and I.
+    fn sums(&self, bin: usize, n_hat: Vec3, reach: f64) -> [f64; 2] {
         let mut sums = [0.0; 2];
         for (sample, u, length) in &self.bins[bin] {
             let Sample { geometry, value_k_sr, information } = sample;
-            let is_hidden = |r_m| hidden_by_moon(r_m, sight, self.moon_radius_m);
+            let is_hidden = |r_m| hidden_by_moon(r_m, n_hat, self.moon_radius_m);
             if *length > reach || is_hidden(geometry.r_i_m) || is_hidden(geometry.r_j_m) {
                 continue;
             }
@@ -269,57 +212,24 @@ impl<'a> Search<'a> {
 
     /// Twice the logarithm of the likelihood ratio.
     fn twice_log(&self, n_hat: Vec3, reach: f64) -> f64 {
-        self.twice_log_of_sight([n_hat; 2], reach)
-    }
-
-    fn twice_log_of_sight(&self, hats: [Vec3; 2], reach: f64) -> f64 {
-        let of_bin = |bin| match self.sums(bin, hats, reach) {
+        let of_bin = |bin| match self.sums(bin, n_hat, reach) {
             [c, i] if c > 0.0 && i > 0.0 => 2.0 * c * c / i,
             _ => 0.0,
         };
         (0..self.bins.len()).map(of_bin).sum()
     }
 
-    /// Power in a direction, of the bin where it is most significant, and its standard deviation, K sr.
-    fn power(&self, n_hat: Vec3) -> Option<[f64; 2]> {
-        let sums = (0..self.bins.len()).map(|bin| self.sums(bin, [n_hat; 2], f64::INFINITY));
+    /// Power in a direction, of the bin where it is most significant, K sr.
+    fn power(&self, n_hat: Vec3) -> Option<f64> {
+        let sums = (0..self.bins.len()).map(|bin| self.sums(bin, n_hat, f64::INFINITY));
         let seen = sums.filter(|[_, i]| *i > 0.0);
         let [c, i] = seen.max_by(|[c, i], [d, j]| (c * c / i).total_cmp(&(d * d / j)))?;
-        Some([c / i, (2.0 * i).sqrt().recip()])
-    }
-
-    /// Scatter of the residuals of a source in a direction in units of their stated deviations, at least 1.
-    fn scatter(&self, n_hat: Vec3) -> f64 {
-        let (mut squares, mut numbers) = (0.0, -2.0);
-        for (sample, ..) in self.bins.iter().flatten() {
-            squares += 2.0 * sample.information * sample.value_k_sr.norm_sqr();
-            numbers += 2.0;
-        }
-        numbers -= self.bins.len() as f64;
-        ((squares - self.twice_log(n_hat, f64::INFINITY)) / numbers.max(1.0)).max(1.0).sqrt()
-    }
-
-    /// Least information on the direction along any axis across it, rad^-2: from the curvature of the likelihood, to which the Moon's limb, an
-    /// edge, does not add.
-    fn information(&self, n_hat: Vec3, longest: f64) -> f64 {
-        let [a, b] = axes(n_hat);
-        // A tenth of a radian of phase on the longest baseline.
-        let h = 0.1 / (TAU * longest.max(1.0));
-        let at = |x: f64, y: f64| {
-            let hat = unit(add(n_hat, add(scale(x * h, a), scale(y * h, b))));
-            0.5 * self.twice_log_of_sight([hat, n_hat], f64::INFINITY) / (h * h)
-        };
-        let middle = at(0.0, 0.0);
-        let xx = 2.0 * middle - at(1.0, 0.0) - at(-1.0, 0.0);
-        let yy = 2.0 * middle - at(0.0, 1.0) - at(0.0, -1.0);
-        let xy = -0.25 * (at(1.0, 1.0) + at(-1.0, -1.0) - at(1.0, -1.0) - at(-1.0, 1.0));
-        // The smaller eigenvalue. Rounding may make it negative where daughters lie in a line; then a radian is not resolved.
-        (0.5 * (xx + yy) - (0.25 * (xx - yy).powi(2) + xy * xy).sqrt()).max(1.0)
+        Some(c / i)
     }
 }
 
 /// Two unit vectors across a direction and each other.
-fn axes(n_hat: Vec3) -> [Vec3; 2] {
+pub(super) fn axes(n_hat: Vec3) -> [Vec3; 2] {
     let across = if n_hat[2].abs() < 0.9 { [0.0, 0.0, 1.0] } else { [1.0, 0.0, 0.0] };
     let a = unit(cross(n_hat, across));
     [a, cross(n_hat, a)]

@@ -4,10 +4,14 @@
 //! visibilities that arrive later out as well.
 
 mod detect;
+mod early;
+mod flux;
 mod locate;
 mod peel;
+mod refine;
 
-pub use detect::{BurstSearch, find_bursts};
+pub use detect::find_bursts;
+pub use early::{BurstAlert, find_alerts};
 pub(super) use locate::{Sample, locate};
 pub use peel::LightCurve;
 
@@ -52,6 +56,17 @@ impl BurstChoice {
     }
 }
 
+/// What a search knows besides the visibilities.
+#[derive(Clone, Copy, Debug)]
+pub struct BurstSearch {
+    /// Radius of the Moon, m.
+    pub moon_radius_m: f64,
+    /// Epoch of the mission, TAI seconds since 1958-01-01.
+    pub epoch_tai_s: f64,
+    /// What is done with bursts: light curves are fitted only for [`BurstChoice::Peel`].
+    pub choice: BurstChoice,
+}
+
 /// A burst in one channel.
 #[derive(Clone, Debug, PartialEq, Serialize, Encode, Decode)]
 pub struct FoundBurst {
@@ -65,18 +80,20 @@ pub struct FoundBurst {
     pub until_s: f64,
     /// Time of the brightest interval, s.
     pub peak_s: f64,
+    /// Start and end of the brightest interval, s.
+    pub peak_span_s: [f64; 2],
     /// Signal-to-noise ratio of a point source at the position. The noise is that of the visibilities and the steady sky.
     pub significance: f64,
-    /// Flux density in that half of an interval in which it is most significant, as an isotropic antenna sees it, Jy.
+    /// Mean flux density in the brightest interval, as an isotropic antenna sees it, Jy.
     pub flux_jy: f64,
     /// Standard deviation of the flux density, Jy.
     pub flux_sigma_jy: f64,
-    /// Ecliptic longitude and latitude, deg, the likeliest first; others have a likelihood within 99 % of its distribution: daughters in
+    /// Ecliptic longitude and latitude, deg, the likeliest first, if there is one; others have a likelihood within 99 % of its distribution: daughters in
     /// one plane do not tell its two sides apart.
     pub positions_deg: Vec<[f64; 2]>,
-    /// Standard deviation of the first position along its worst direction, deg. Too small for arrays of few wavelengths, as the steady sky is
-    /// the same at all times.
-    pub position_sigma_deg: f64,
+    /// Standard deviations of each position along the longer and the shorter axis of its error ellipse, and the angle of the longer axis from
+    /// ecliptic north through east, deg.
+    pub position_errors_deg: Vec<[f64; 3]>,
     /// `sun` or `jupiter` if that is within three standard deviations (and two degrees of the Sun, 0.03 of Jupiter) of a position known to
     /// six degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -130,11 +147,11 @@ impl fmt::Display for FoundBurst {
         let hz = Dimension::Frequency.show(self.frequency_hz);
         write!(f, "a burst at {hz} from {:.1} s to {:.1} s: ", self.from_s, self.until_s)?;
         write!(f, "{:.2e} Jy, {:.0} sigma", self.flux_jy, self.significance)?;
-        if let Some([longitude, latitude]) = self.positions_deg.first() {
-            let sigma = self.position_sigma_deg;
+        let first = self.positions_deg.first().zip(self.position_errors_deg.first());
+        if let Some(([longitude, latitude], [longer, shorter, _])) = first {
             write!(
                 f,
-                ", from ecliptic longitude {longitude:.2}, latitude {latitude:.2} deg (+- {sigma:.2})"
+                ", from ecliptic longitude {longitude:.2}, latitude {latitude:.2} deg (+- {longer:.2}, {shorter:.2})"
             )?;
             match self.positions_deg.len() - 1 {
                 0 => {}
@@ -265,6 +282,8 @@ struct BurstTable {
     longest_s: f64,
     /// Memory of all light curves.
     curves_bytes: usize,
+    /// Alerts of this session, before their passes ended.
+    alerts: Vec<BurstAlert>,
 }
 
 impl BurstTable {
@@ -280,6 +299,13 @@ impl BurstTable {
         let at = starts.partition_point(|(from_s, _)| *from_s <= burst.from_s);
         starts.insert(at, (burst.from_s, self.bursts.len()));
         self.bursts.push(burst);
+    }
+
+    /// Whether a burst of a channel has a time in it.
+    fn knows(&self, channel: u16, peak_s: f64) -> bool {
+        let starts = self.starts.get(&channel).map(Vec::as_slice).unwrap_or_default();
+        let until = starts.partition_point(|(from_s, _)| *from_s <= peak_s);
+        starts[..until].iter().any(|(_, index)| self.bursts[*index].until_s > peak_s)
     }
 
     /// The bursts in the time of a block, and perhaps some beside it, without the first `known`, in the order in which they were found.
@@ -325,13 +351,31 @@ impl FoundBursts {
         has_room
     }
 
+    /// Adds an alert, unless there is one of its time, or a burst.
+    pub fn alert(&self, alert: BurstAlert) {
+        let mut table = self.table();
+        let is_known = table.alerts.iter().any(|other| other.is_same_as(&alert));
+        if !is_known && !table.knows(alert.channel, alert.peak_s) && table.alerts.len() < BURSTS_MAX {
+            table.alerts.push(alert);
+        }
+    }
+
+    /// Alerts of this session, except the first `seen`.
+    #[must_use]
+    pub fn alerts_since(&self, seen: usize) -> Vec<BurstAlert> {
+        self.table().alerts.get(seen..).unwrap_or_default().to_vec()
+    }
+
+    /// Number of alerts of this session.
+    #[must_use]
+    pub fn alerts(&self) -> usize {
+        self.table().alerts.len()
+    }
+
     /// Whether a burst of the table has the peak of another in its time. What was subtracted leaves its power in the weights.
     #[must_use]
     pub fn knows(&self, burst: &FoundBurst) -> bool {
-        let table = self.table();
-        let starts = table.starts.get(&burst.channel).map(Vec::as_slice).unwrap_or_default();
-        let until = starts.partition_point(|(from_s, _)| *from_s <= burst.peak_s);
-        starts[..until].iter().any(|(_, index)| table.bursts[*index].until_s > burst.peak_s)
+        self.table().knows(burst.channel, burst.peak_s)
     }
 
     /// Whether a burst is subtracted from visibilities of a channel in a span of time.

@@ -67,6 +67,7 @@ pub struct LightCurve {
 }
 
 /// A visibility of a burst, for the fit.
+#[derive(Clone, Copy)]
 pub(super) struct BurstRow<'a> {
     pub(super) block: &'a PlacedVisibilities,
     pub(super) k: usize,
@@ -75,12 +76,12 @@ pub(super) struct BurstRow<'a> {
 }
 
 impl BurstRow<'_> {
-    fn duration_s(&self) -> f64 {
+    pub(super) fn duration_s(&self) -> f64 {
         duration_s(self.block, self.k)
     }
 
     /// Variance, real and imaginary part together, with the steady sky counted a number of times.
-    fn variance_k2_sr2(&self, times: f64) -> f64 {
+    pub(super) fn variance_k2_sr2(&self, times: f64) -> f64 {
         times * self.steady_k2_sr2 + 2.0 / self.block.weight[self.k]
     }
 }

@@ -90,7 +90,7 @@ fn a_bright_burst_is_found_where_and_when_it_is() {
     let off_deg =
         |[longitude, latitude]: &[f64; 2]| norm(sub(direction(*longitude, *latitude), n_hat)).to_degrees();
     let nearest_deg = burst.positions_deg.iter().map(off_deg).fold(f64::INFINITY, f64::min);
-    assert!(nearest_deg < 0.1 && burst.position_sigma_deg < 0.1, "{nearest_deg} {burst:?}");
+    assert!(nearest_deg < 0.1 && burst.position_errors_deg[0][0] < 0.1, "{nearest_deg} {burst:?}");
     // The mean over the peak's bin: the light curve rises and falls within it.
     assert!(burst.flux_jy > 2e7 && burst.flux_jy < 1e8, "{burst}");
     assert!(burst.significance > 100.0 && burst.name.is_none(), "{burst}");
@@ -112,12 +112,129 @@ fn positions_are_within_their_errors() {
         };
         let nearest_deg = burst.positions_deg.iter().map(off_deg).fold(f64::INFINITY, f64::min);
         // 99 % of positions lie within 3.03 standard deviations of the worst axis.
-        within += i32::from(nearest_deg < 3.03 * burst.position_sigma_deg);
-        let error = (burst.flux_jy * k_sr_per_jy(FREQUENCY_HZ) / (5.0 * STEADY_K_SR) - 1.0).abs();
-        // Five standard deviations of the mean of 56 visibilities with a signal-to-noise ratio of 5 sqrt(2) each.
-        assert!(error < 5.0 / (5.0 * 112.0_f64.sqrt()), "{error} {burst}");
+        within += i32::from(nearest_deg < 3.03 * burst.position_errors_deg[0][0]);
+        // Nine tenths of the time nothing is measured. One of ten is off by more than four deviations with a probability of 6e-4.
+        let off_jy = (burst.flux_jy - 5.0 * STEADY_K_SR / k_sr_per_jy(FREQUENCY_HZ)).abs();
+        assert!(off_jy < 4.0 * burst.flux_sigma_jy, "{burst:?}");
     }
     assert!(within >= 9, "{within} of 10");
+}
+
+/// Rate of the orbit, rad/s.
+const TURN_RAD_S: f64 = std::f64::consts::TAU / 8248.68;
+
+/// The mean of a type III burst of peak 1 that starts at 0, from one time to another: a rise of 5 s, a decay of 11.5 s.
+fn mean_of_burst([from_s, until_s]: [f64; 2]) -> f64 {
+    let until = |after_s: f64| {
+        let (risen, fallen) = (after_s.clamp(0.0, 5.0), (after_s - 5.0).max(0.0));
+        0.1 * risen * risen + 11.5 * (1.0 - (-fallen / 11.5).exp())
+    };
+    (until(until_s) - until(from_s)) / (until_s - from_s)
+}
+
+/// Visibilities of 900 s about a burst that starts after 400 s, in integrations in which baselines move by an eighth of a wavelength, or of 25 s,
+/// and which are not in step. The sky is 150 sources, as steady as stars. With `smears` the burst's fringe turns in integrations.
+fn pass_of_burst(
+    array: &Array,
+    stream: &mut ChaCha8Rng,
+    from_s: f64,
+    (n_hat, peak_k_sr): (Vec3, f64),
+    smears: bool,
+) -> Vec<PlacedVisibilities> {
+    let mut normal = || -> f64 { StandardNormal.sample(stream) };
+    let sources: Vec<Vec3> = (0..150).map(|_| unit([normal(), normal(), normal()])).collect();
+    let of_each = STEADY_K_SR / 150.0_f64.sqrt();
+    let mut block = |pair: crate::units::Pair| {
+        let mut block =
+            PlacedVisibilities { pair, frequency_hz: FREQUENCY_HZ, ..PlacedVisibilities::default() };
+        let at = |t_s: f64| [pair.i, pair.j].map(|n| array.position_m(n.into(), t_s));
+        let wave = |t_s: f64, k_sr: f64, hat: Vec3| {
+            let [r_i_m, r_j_m] = at(t_s);
+            let is_hidden = [r_i_m, r_j_m].iter().any(|r_m| hidden_by_moon(*r_m, hat, 1_737_100.0));
+            plane_wave(if is_hidden { 0.0 } else { k_sr }, hat, sub(r_i_m, r_j_m), FREQUENCY_HZ)
+        };
+        let [r_i_m, r_j_m] = at(from_s);
+        let duration_s =
+            (299_792_458.0 / FREQUENCY_HZ / (8.0 * TURN_RAD_S * norm(sub(r_i_m, r_j_m)))).min(25.0);
+        let first_s = from_s + duration_s * (0.5 + 0.1 * normal().abs());
+        for k in 0..(880.0 / duration_s) as u32 {
+            let t_s = first_s + duration_s * f64::from(k);
+            let mut value = Complex64::new(normal(), normal()) * 1e3;
+            value += sources.iter().map(|hat| wave(t_s, of_each, *hat)).sum::<Complex64>();
+            for part in 0..16 {
+                let start_s = t_s + duration_s * (f64::from(part) / 16.0 - 0.5);
+                let ends_s = [start_s, start_s + duration_s / 16.0];
+                let power = peak_k_sr / 16.0 * mean_of_burst(ends_s.map(|end_s| end_s - from_s - 400.0));
+                if power > 0.0 {
+                    value += wave(if smears { 0.5 * (ends_s[0] + ends_s[1]) } else { t_s }, power, n_hat);
+                }
+            }
+            let [r_i_m, r_j_m] = at(t_s);
+            block.time_s.push(t_s);
+            block.r_i_m.push(r_i_m);
+            block.r_j_m.push(r_j_m);
+            block.value_k_sr.push(value);
+            block.weight.push(1e-6);
+            block.duration_s.push(duration_s as f32);
+        }
+        block
+    };
+    all_pairs(array.satellites()).into_iter().map(&mut block).collect()
+}
+
+/// Offsets of bursts along the longer axis of the nearest direction's error ellipse, and errors of flux densities, in standard deviations.
+fn errors_in_sigma(seeds: std::ops::Range<u64>) -> Vec<[f64; 2]> {
+    let arcs_m = [30.0, 100.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0].to_vec();
+    let array = Array::new(&crate::array::ArrayConfig { arcs_m, ..Default::default() }).unwrap();
+    let mut found_errors = Vec::new();
+    for seed in seeds {
+        let mut stream = ChaCha8Rng::seed_from_u64(seed);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
+        let n_hat = unit([normal(), normal(), normal()]);
+        // From 5 to 800 times the steady sky.
+        let peak_k_sr = 60.0 * STEADY_K_SR * (0.8 * normal().clamp(-3.0, 3.0)).exp();
+        let from_s = seen_from_s(&array, n_hat);
+        let blocks = pass_of_burst(&array, &mut stream, from_s, (n_hat, peak_k_sr), seed % 2 == 0);
+        let [burst] = &found(&blocks)[..] else { panic!("{seed}") };
+        let places = burst.positions_deg.iter().zip(&burst.position_errors_deg);
+        let off = |([longitude, latitude], [longer, _, angle]): (&[f64; 2], &[f64; 3])| {
+            let hat = direction(*longitude, *latitude);
+            let east = unit([-hat[1], hat[0], 0.0]);
+            let north = crate::units::vector::cross(hat, east);
+            let (sin, cos) = angle.to_radians().sin_cos();
+            let away = sub(n_hat, hat);
+            (norm(away), (sin * dot(away, east) + cos * dot(away, north)).to_degrees().abs() / longer)
+        };
+        let nearest = places.map(off).min_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
+        let of_peak = burst.peak_span_s.map(|t_s| t_s - from_s - 400.0);
+        let flux_jy = peak_k_sr / k_sr_per_jy(FREQUENCY_HZ) * mean_of_burst(of_peak);
+        found_errors.push([nearest.1, (burst.flux_jy - flux_jy).abs() / burst.flux_sigma_jy]);
+    }
+    found_errors
+}
+
+#[test]
+fn errors_of_directions_and_fluxes_hold() {
+    let errors = errors_in_sigma(0..24);
+    let within = |which: usize, sigma: f64| errors.iter().filter(|error| error[which] < sigma).count();
+    // Of 24, 16.3 are expected within one standard deviation and 22.8 within 1.96: three standard deviations of these numbers below, by the
+    // binomial distribution.
+    for which in 0..2 {
+        assert!(within(which, 1.0) >= 10 && within(which, 1.96) >= 20, "{which} {errors:?}");
+    }
+}
+
+#[test]
+#[ignore = "a table"]
+fn long_the_table_of_errors_of_bursts() {
+    let errors = errors_in_sigma(1000..1200);
+    for (which, name) in ["directions", "fluxes"].iter().enumerate() {
+        let share = |sigma: f64| errors.iter().filter(|error| error[which] < sigma).count() as f64 / 200.0;
+        let [one, two, three] = [1.0, 1.96, 3.0].map(share);
+        println!("{name}: {one} within 1, {two} within 1.96, {three} within 3 of their errors");
+        // Four standard deviations of the shares expected, and no more than a third too large.
+        assert!(one > 0.55 && two > 0.89, "{errors:?}");
+    }
 }
 
 #[test]
@@ -132,6 +249,55 @@ fn bursts_are_found_from_the_stated_power_on_and_quiet_passes_have_none() {
     };
     // The ratio of 8 to the quartile is 8 * 2 ln 2 = 11.1 times the mean square: a power of 3.3 times the rms.
     assert_eq!([count(0.0), count(1.5), count(4.5)], [0, 0, 8]);
+}
+
+#[test]
+fn alerts_come_while_a_burst_lasts_and_not_without_one() {
+    let array = array();
+    let n_hat = direction(10.0, 50.0);
+    let from_s = seen_from_s(&array, n_hat);
+    // Ends of what has arrived: 20 s before the burst, 30 s after its start, 300 s after its end, and of the pass.
+    let counts = |seed: u64, factor: f64, daughters: u8| {
+        let k_sr =
+            |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { factor * STEADY_K_SR } else { 0.0 };
+        let mut blocks = pass(&array, seed, from_s, n_hat, k_sr);
+        blocks.retain(|block| block.pair.i < daughters);
+        let bursts = FoundBursts::new(BurstChoice::Keep);
+        [98, 103, 136, 300].map(|visibilities| {
+            let so_far = |block: &PlacedVisibilities| {
+                let mut so_far = block.without_visibilities();
+                (0..visibilities).for_each(|k| so_far.push_from(block, k));
+                so_far
+            };
+            let so_far: Vec<PlacedVisibilities> = blocks.iter().map(so_far).collect();
+            let alerts = find_alerts(&so_far.iter().collect::<Vec<_>>());
+            assert!(
+                alerts.iter().all(|alert| (960.0..1060.0).contains(&(alert.peak_s - from_s))),
+                "{alerts:?}"
+            );
+            alerts.into_iter().for_each(|alert| bursts.alert(alert));
+            bursts.alerts()
+        })
+    };
+    for seed in 300..304 {
+        assert_eq!(counts(seed, 6.0, 8), [0, 1, 1, 1]);
+        assert_eq!(counts(seed, 0.0, 8), [0; 4]);
+        // What only pairs of the first daughter show may be its own.
+        assert_eq!(counts(seed, 6.0, 1), [0; 4]);
+    }
+    // A burst that is known is no news.
+    let blocks =
+        pass(
+            &array,
+            300,
+            from_s,
+            n_hat,
+            |t_s| if (1000.0..1060.0).contains(&(t_s - from_s)) { 2e5 } else { 0.0 },
+        );
+    let bursts = FoundBursts::new(BurstChoice::Keep);
+    found(&blocks).into_iter().for_each(|burst| assert!(bursts.add(burst)));
+    find_alerts(&blocks.iter().collect::<Vec<_>>()).into_iter().for_each(|alert| bursts.alert(alert));
+    assert_eq!((bursts.len(), bursts.alerts()), (1, 0));
 }
 
 #[test]
@@ -165,7 +331,8 @@ fn visibilities_of_a_burst_are_divided_from_others() {
         flux_jy: 1.0,
         flux_sigma_jy: 0.1,
         positions_deg: vec![[0.0, 0.0]],
-        position_sigma_deg: 1.0,
+        position_errors_deg: vec![[1.0, 0.5, 0.0]],
+        peak_span_s: [from_s, from_s + 1.0],
         name: None,
         seen_from_m: [[2.0371e6, 0.0, 0.0]; 3],
         moon_radius_m: 1_737_100.0,

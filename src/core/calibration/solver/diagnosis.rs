@@ -213,9 +213,8 @@ fn source(pairs: &[Vec<Datum>]) -> Option<ModelFault> {
         thinned(pair, OF_PAIR).into_iter().filter(|_| is_known).map(sample).collect()
     };
     let samples: Vec<Sample> = pairs.iter().flat_map(samples).collect();
-    let located = locate(&[samples], geometry.moon_radius_m, &[])?;
-    let n_hat = *located.directions.first()?;
-    let mut power_k_sr = located.power_k_sr;
+    let located = *locate(&[samples], geometry.moon_radius_m).first()?;
+    let (n_hat, mut power_k_sr) = (located.hat, located.power_k_sr);
     let model = |datum: &Datum, power_k_sr: f64| datum.model + power_k_sr * datum.fringe(n_hat);
     for _ in 0..ROUNDS {
         let (mut cross, mut gram) = (0.0, 0.0);

@@ -18,7 +18,7 @@ use crate::imaging::AccumulatorState;
 
 const MAGIC: &[u8; 8] = b"LNRSTA12";
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of version 12; earlier ones lack errors of gains, or more: make a new state \
+const VERSION: &str = "a checkpoint of version 12; earlier ones lack errors of gains and of bursts, or more: make a new state \
 with `lunarray rebuild`, or replay the files into a new folder";
 /// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;

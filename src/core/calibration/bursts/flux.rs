@@ -1,0 +1,254 @@
+//! The flux of a burst by time, finer than its integrations.
+//!
+//! The integrations of pairs are not in step, so that together they resolve what is shorter than one of them. The powers of short cells are fitted
+//! with a random walk as prior, loose enough for the rise of a type III burst.
+//!
+//! A burst is short against an integration, in which the fringe turns by up to an eighth: what is measured has the phase of when the burst was.
+//! Simulations that do not smear integrations have the phase of the middle.
+
+use std::collections::BTreeMap;
+use std::f64::consts::{PI, TAU};
+
+use num_complex::Complex64;
+
+use super::peel::BurstRow;
+use crate::array::hidden_by_moon;
+use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::numerics::DenseFactor;
+use crate::response::pixel::PairGeometry;
+use crate::units::Pair;
+use crate::units::vector::{Vec3, add, dot, scale, sub};
+
+/// Cells of a burst.
+const CELLS: usize = 128;
+
+/// Shortest cell, s.
+const CELL_S_MIN: f64 = 0.5;
+
+/// Time in which the prior lets the power change by its largest value, s.
+const WALK_S: f64 = 5.0;
+
+/// Largest share of a pair in a flux whose error is found by pairs.
+const SHARE_MAX: f64 = 0.7;
+
+/// Longest time between visibilities whose difference is the motion of a baseline, s.
+const MOTION_S_MAX: f64 = 150.0;
+
+/// A source that may have a flux.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    pub(super) hat: Vec3,
+    pub(super) moon_radius_m: f64,
+    /// Whether fringes turn during integrations.
+    pub(super) smears: bool,
+}
+
+/// The source in a visibility: `exp(2 pi i turns) V` is the sum of the powers of cells times their factors.
+struct Term {
+    turns: f64,
+    cells: Vec<(usize, Complex64)>,
+}
+
+/// What a visibility has of the source.
+pub(super) struct Seen {
+    /// Power, K sr.
+    pub(super) power_k_sr: f64,
+    /// Baseline when the burst was, wavelengths.
+    pub(super) u: Vec3,
+    /// The visibility, K sr, as it were at that time, K sr.
+    pub(super) value_k_sr: Complex64,
+}
+
+/// Powers by time, and how they follow from visibilities.
+pub(super) struct Flux {
+    place: Place,
+    from_s: f64,
+    cell_s: f64,
+    power_k_sr: Vec<f64>,
+    factor: DenseFactor,
+}
+
+/// Baseline of a visibility, wavelengths.
+pub(super) fn baseline(block: &PlacedVisibilities, k: usize) -> Vec3 {
+    geometry(block, k).baseline_wavelengths()
+}
+
+pub(super) fn geometry(block: &PlacedVisibilities, k: usize) -> PairGeometry {
+    PairGeometry {
+        r_i_m: block.r_i_m[k],
+        r_j_m: block.r_j_m[k],
+        frequency_hz: block.frequency_hz,
+        moon_radius_m: 0.0,
+        response: AntennaResponse::Isotropic,
+    }
+}
+
+/// Motion of the baseline of a visibility, wavelengths per s, by those beside it in its block; zero without one.
+fn motion(block: &PlacedVisibilities, k: usize) -> Vec3 {
+    let (before, after) = (k.saturating_sub(1), (k + 1).min(block.len() - 1));
+    let s = block.time_s[after] - block.time_s[before];
+    if s > 0.0 && s < MOTION_S_MAX {
+        scale(s.recip(), sub(baseline(block, after), baseline(block, before)))
+    } else {
+        [0.0; 3]
+    }
+}
+
+impl Flux {
+    /// Fits the powers; `None` if the visibilities do not determine them.
+    pub(super) fn fit(rows: &[BurstRow], place: Place, [from_s, until_s]: [f64; 2]) -> Option<Self> {
+        let cell_s = ((until_s - from_s) / CELLS as f64).max(CELL_S_MIN);
+        let cells = (((until_s - from_s) / cell_s).ceil() as usize).clamp(1, CELLS);
+        let power_k_sr = vec![0.0; cells];
+        let mut flux = Self { place, from_s, cell_s, power_k_sr, factor: DenseFactor::new(&[1.0], 1)? };
+        let (mut matrix, mut powers, mut largest_k_sr) = (vec![0.0; cells * cells], vec![0.0; cells], 0.0);
+        for row in rows {
+            let Some(term) = flux.term(row) else { continue };
+            // The part across the fringe says where the source is.
+            let (information, value) = (flux.information(row), term.value(row).re);
+            largest_k_sr = f64::max(largest_k_sr, value);
+            for (cell, factor) in &term.cells {
+                powers[*cell] += information * factor.re * value;
+                for (other, of_other) in &term.cells {
+                    matrix[cell * cells + other] += information * factor.re * of_other.re;
+                }
+            }
+        }
+        // Information counts both parts of a visibility: half the inverse variance.
+        let tie = 0.5 * WALK_S / (cell_s * largest_k_sr * largest_k_sr);
+        for cell in 1..cells {
+            let before = cell - 1;
+            matrix[cell * (cells + 1)] += tie;
+            matrix[before * (cells + 1)] += tie;
+            matrix[cell * cells + before] -= tie;
+            matrix[before * cells + cell] -= tie;
+        }
+        // Before and after, there is no power.
+        matrix[0] += tie;
+        matrix[cells * cells - 1] += tie;
+        flux.factor = DenseFactor::new(&matrix, cells)?;
+        flux.factor.solve(&mut powers);
+        flux.power_k_sr = powers;
+        Some(flux)
+    }
+
+    /// Power of the brightest cell, K sr.
+    pub(super) fn largest_k_sr(&self) -> f64 {
+        self.power_k_sr.iter().copied().fold(0.0, f64::max)
+    }
+
+    /// Cells of an integration, the parts of it that lie in them, and their middles after that of the integration, s.
+    fn shares(&self, row: &BurstRow) -> impl Iterator<Item = (usize, f64, f64)> + use<> {
+        let (cell_s, cells) = (self.cell_s, self.power_k_sr.len());
+        let duration = row.duration_s() / cell_s;
+        let middle = (row.block.time_s[row.k] - self.from_s) / cell_s;
+        let (from, until) = (middle - 0.5 * duration, middle + 0.5 * duration);
+        let within = from.max(0.0) as usize..(until.max(0.0).ceil() as usize).min(cells);
+        let part = move |cell: usize| {
+            let [start, end] = [from.max(cell as f64), until.min((cell + 1) as f64)];
+            (cell, (end - start) / duration, cell_s * (0.5 * (start + end) - middle))
+        };
+        within.map(part).filter(|(_, share, _)| *share > 0.0)
+    }
+
+    /// The source in a visibility; `None` where the Moon hides it.
+    fn term(&self, row: &BurstRow) -> Option<Term> {
+        let (block, k, Place { hat, moon_radius_m, smears }) = (row.block, row.k, self.place);
+        let is_hidden = |r_m: Vec3| hidden_by_moon(r_m, hat, moon_radius_m);
+        if is_hidden(block.r_i_m[k]) || is_hidden(block.r_j_m[k]) {
+            return None;
+        }
+        let rate = if smears { dot(motion(block, k), hat) } else { 0.0 };
+        // A cell averages the fringe over its part of the integration.
+        let duration_s = row.duration_s();
+        let factor = |(cell, share, after_s): (usize, f64, f64)| {
+            (cell, share * sinc(PI * rate * share * duration_s) * phasor(-rate * after_s))
+        };
+        Some(Term { turns: dot(baseline(block, k), hat), cells: self.shares(row).map(factor).collect() })
+    }
+
+    /// What a visibility has of the source; `None` where the Moon hides it.
+    pub(super) fn seen(&self, row: &BurstRow) -> Option<Seen> {
+        let term = self.term(row)?;
+        let sum = self.sum(&term);
+        let mut weighted = [0.0; 2];
+        for (cell, share, after_s) in self.shares(row) {
+            let power = share * self.power_k_sr[cell].max(0.0);
+            weighted = [weighted[0] + power, weighted[1] + power * after_s];
+        }
+        let after_s = if weighted[0] > 0.0 && self.place.smears { weighted[1] / weighted[0] } else { 0.0 };
+        let moved = scale(after_s, motion(row.block, row.k));
+        let turn = if sum.re > 0.0 {
+            sum.conj() / sum.norm() * phasor(-dot(moved, self.place.hat))
+        } else {
+            1.0.into()
+        };
+        Some(Seen {
+            power_k_sr: if sum.re > 0.0 { sum.norm() } else { 0.0 },
+            u: add(baseline(row.block, row.k), moved),
+            value_k_sr: row.block.value_k_sr[row.k] * turn,
+        })
+    }
+
+    /// Mean power in an integration, K sr, also where the Moon hides the source.
+    pub(super) fn power_k_sr_in(&self, row: &BurstRow) -> f64 {
+        self.shares(row).map(|(cell, share, _)| share * self.power_k_sr[cell]).sum()
+    }
+
+    fn sum(&self, term: &Term) -> Complex64 {
+        term.cells.iter().map(|(cell, factor)| factor * self.power_k_sr[*cell]).sum()
+    }
+
+    /// Inverse variance of a visibility. The steady sky hardly changes in a cell, and so counts once there.
+    fn information(&self, row: &BurstRow) -> f64 {
+        row.variance_k2_sr2((self.cell_s / row.duration_s()).max(1.0)).recip()
+    }
+
+    /// Mean power in a span, and its standard deviation, K sr: by what pairs, each by itself, say of it, and by the model, whose prior is not the
+    /// burst.
+    pub(super) fn mean_k_sr(&self, rows: &[BurstRow], [from_s, until_s]: [f64; 2]) -> [f64; 2] {
+        let start = |cell: usize| self.from_s + self.cell_s * cell as f64;
+        let share = |cell: usize| {
+            (start(cell + 1).min(until_s) - start(cell).max(from_s)).max(0.0) / (until_s - from_s)
+        };
+        let shares: Vec<f64> = (0..self.power_k_sr.len()).map(share).collect();
+        let mean = shares.iter().zip(&self.power_k_sr).map(|(share, power)| share * power).sum();
+        let mut response = shares.clone();
+        self.factor.solve(&mut response);
+        // Of each pair: what its residuals add, and how much of the mean it determines.
+        let mut pairs: BTreeMap<Pair, [f64; 2]> = BTreeMap::new();
+        for row in rows {
+            let Some(term) = self.term(row) else { continue };
+            let residual = (term.value(row) - self.sum(&term)).re;
+            let factor: f64 = term.cells.iter().map(|(cell, factor)| factor.re * response[*cell]).sum();
+            let inside = term.cells.iter().filter(|(cell, _)| shares[*cell] > 0.0);
+            let inside: f64 = inside.map(|(_, factor)| factor.re).sum();
+            let information = self.information(row);
+            let [sum, determined] = pairs.entry(row.block.pair).or_default();
+            *sum += information * factor * residual;
+            *determined += information * factor * inside;
+        }
+        let square = |[sum, determined]: &[f64; 2]| (sum / (1.0 - determined.clamp(0.0, SHARE_MAX))).powi(2);
+        let by_pairs: f64 = pairs.values().map(square).sum();
+        let by_model: f64 =
+            0.5 * shares.iter().zip(&response).map(|(share, response)| share * response).sum::<f64>();
+        [mean, (by_pairs + by_model).sqrt()]
+    }
+}
+
+impl Term {
+    /// A visibility with the fringe's phase at its middle taken out.
+    fn value(&self, row: &BurstRow) -> Complex64 {
+        row.block.value_k_sr[row.k] * phasor(self.turns)
+    }
+}
+
+/// `sin(x) / x`.
+pub(super) fn sinc(x: f64) -> f64 {
+    if x.abs() < 1e-6 { 1.0 } else { x.sin() / x }
+}
+
+/// `exp(2 pi i turns)`.
+pub(super) fn phasor(turns: f64) -> Complex64 {
+    Complex64::cis(TAU * (turns - turns.round()))
+}
