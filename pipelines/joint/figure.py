@@ -6,7 +6,7 @@
     lunarray joint one --count 8 --out powers
     lunarray joint all --no-powers --count 8 --out channels
     lunarray joint all --count 8 --out both
-    lunarray sky bring.toml --freq-hz 1e7 --nside 64 --out sky.fits
+    lunarray sky bring.toml --freq-hz 1e7 --nside 128 --out sky.fits
     python figure.py lunarray sky.fits bring.png {alone,powers,channels,both}/10.000MHz/map.fits
 """
 

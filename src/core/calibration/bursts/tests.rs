@@ -226,6 +226,7 @@ fn errors_of_directions_and_fluxes_hold() {
 
 #[test]
 #[ignore = "a table"]
+#[allow(clippy::print_stdout)] // It prints what it measured.
 fn long_the_table_of_errors_of_bursts() {
     let errors = errors_in_sigma(1000..1200);
     for (which, name) in ["directions", "fluxes"].iter().enumerate() {

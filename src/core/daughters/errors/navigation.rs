@@ -33,6 +33,7 @@ impl NavigationConfig {
 
     /// Whether reported positions have errors.
     #[must_use]
+    #[doc(hidden)]
     pub fn has_position_errors(&self) -> bool {
         [&self.along_m, &self.across_m, &self.radial_m].iter().any(|terms| !terms.is_none())
     }

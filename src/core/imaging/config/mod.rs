@@ -354,6 +354,7 @@ impl MapConfig {
 
     /// Whether something is set that only maps over pixels have.
     #[must_use]
+    #[doc(hidden)]
     pub fn has_pixel_settings(&self) -> bool {
         self.matrix != MatrixKind::default() || self.rows != PixelMethod::default()
     }
