@@ -275,8 +275,9 @@ fn a_triple_on_ellipses_is_mapped_by_refinement() {
     let rho: Vec<f64> =
         channel["rho"].as_array().unwrap().iter().map(|rho| rho.as_f64().unwrap_or(0.0)).collect();
     assert!(rho[1..=6].iter().all(|rho| *rho > 0.9), "{rho:?}");
-    // A ground that knows nothing of the orbits takes a circle, and says what to do.
-    let (sent, lone) = (format!("{out}/downlink.ccsds"), place.file("lone.toml", b"[map]\nnside = 4\n"));
+    // A ground with a file for satellites on a circle says what to do.
+    let (sent, lone) =
+        (format!("{out}/downlink.ccsds"), place.file("lone.toml", b"[array]\n[map]\nnside = 4\n"));
     let found = lunarray(&["replay", &sent, "--map", &lone, "--out", &place.path("lone")]);
     let said = [found.stdout, found.stderr].concat();
     assert!(String::from_utf8_lossy(&said).contains("the satellites do not share a circle: map.engine"));

@@ -21,6 +21,7 @@ use self::timing::{
 };
 use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, Samples, SpaceFrame};
+use crate::imaging::EngineKind;
 use crate::mother::Fidelity;
 use crate::pipeline::Config;
 use crate::pipeline::PipelineError;
@@ -114,6 +115,7 @@ pub struct Bench {
 pub fn bench_config() -> Config {
     let mut config = Config { name: "bench".to_owned(), ..Config::default() };
     config.sky.nside = 8;
+    config.map.engine = EngineKind::Pixel;
     config.spacecraft.fidelity = Fidelity::Samples;
     config.spacecraft.channels_hz = (1..=30).map(|k| 1e6 * f64::from(k)).collect();
     config.spacecraft.duration_s = 3e4;

@@ -223,7 +223,7 @@ fn is_system_error(error: &(dyn std::error::Error + 'static)) -> bool {
 ///
 /// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage, or an
 /// unusable configuration. 3: a failure of the system: a disk, a socket, a lock, memory. 128 plus the number of a signal:
-/// interrupted, by Ctrl-C (130), SIGTERM (143) or SIGHUP (129); a second signal ends the process immediately with the same code.
+/// interrupted, by Ctrl-C (130), SIGTERM (143) or SIGHUP (129); a second one, at least 0.2 s later, ends the process at once.
 /// SIGTERM is the regular end of a ground segment that listens or follows: 0.
 #[must_use]
 pub fn main() -> ExitCode {

@@ -24,6 +24,9 @@ const VISIBILITIES_MAX: usize = 1 << 18;
 /// take as long as some nine of all of it.
 const GROWTH: f64 = 1.0 / 8.0;
 
+/// The same while nothing else waits.
+const IDLE_GROWTH: f64 = 1.0 / 64.0;
+
 /// A block of visibilities, and the packet that brought it.
 pub(super) struct WatchedBlock {
     pub(super) placed: PlacedVisibilities,
@@ -77,11 +80,12 @@ impl BurstWatch {
         channel.blocks.push(WatchedBlock { placed, sent, is_used });
     }
 
-    /// Searches channels of the open pass: those that have grown enough, or, while nothing else waits, those that have grown.
+    /// Searches channels of the open pass: those that have grown enough, less while nothing else waits.
     pub(super) fn alert(&mut self, bursts: &FoundBursts, is_idle: bool) {
         for channel in self.channels.values_mut() {
             let new = channel.visibilities - channel.searched;
-            if new > 0 && (is_idle || new as f64 > GROWTH * channel.searched as f64) {
+            let growth = if is_idle { IDLE_GROWTH } else { GROWTH };
+            if new as f64 > growth * channel.searched as f64 {
                 channel.searched = channel.visibilities;
                 let placed: Vec<_> = channel.blocks.iter().map(|block| &block.placed).collect();
                 find_alerts(&placed).into_iter().for_each(|alert| bursts.alert(alert));

@@ -83,6 +83,8 @@ impl ConfigSource {
         let settings = keys.flat_map(|(name, section)| {
             section.iter().map(move |(key, value)| format!("{name}.{key}={value}"))
         });
-        Ok(settings.collect())
+        // What `auto` was for the run's orbits.
+        let engine = if config.map.is_harmonic() { "harmonic" } else { "pixel" };
+        Ok(settings.chain([format!("map.engine={engine}")]).collect())
     }
 }

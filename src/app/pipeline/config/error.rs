@@ -15,7 +15,7 @@ use crate::sky::fits::FitsError;
 use crate::units::bytes_text;
 
 /// Share of the visibilities of a run, refused for their positions, from which on its map has the wrong engine.
-const OFF_CIRCLE_SHARE: f64 = 0.1;
+const OFF_CIRCLE_SHARE: f64 = 0.01;
 
 /// What to do where the harmonic engine refused many visibilities for their positions; a line, or nothing.
 pub(in crate::pipeline) fn advice_off_circle(ledger: &LedgerReport<VisibilityReason>) -> &'static str {

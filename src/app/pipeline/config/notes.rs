@@ -98,11 +98,10 @@ impl Config {
     pub(super) fn corrects_positions(&self) -> bool {
         let has_positions =
             |path: &PathBuf| GainsFile::read(path).is_ok_and(|file| !file.positions.is_empty());
-        match self.calibration.hook {
-            CalibrationHook::AntennaGains => self.calibration.gains_file.as_ref().is_some_and(has_positions),
-            CalibrationHook::Solve => self.calibrate.position_sigma_m > 0.0,
-            CalibrationHook::Identity => false,
-        }
+        let is_read = self.calibration.hook == CalibrationHook::AntennaGains;
+        // `lunarray calibrate` solves for them, whatever the hook.
+        self.calibrate.position_sigma_m > 0.0
+            || is_read && self.calibration.gains_file.as_ref().is_some_and(has_positions)
     }
 
     /// A note if the orbital period does not fit the altitude.

@@ -35,7 +35,8 @@ impl Plan {
     ///
     /// # Errors
     /// An invalid array, or one that never observes.
-    pub fn new(config: Config) -> Result<Self, PipelineError> {
+    pub fn new(mut config: Config) -> Result<Self, PipelineError> {
+        config.choose_engine(true);
         let array = Arc::new(Array::new(&config.array)?);
         let spacecraft = &config.spacecraft;
         let instrument = Instrument {

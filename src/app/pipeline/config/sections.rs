@@ -197,13 +197,12 @@ impl Config {
         }
     }
 
-    /// Replaces `map.engine = "auto"` by what orbits, positions and the other settings of maps allow.
-    pub(super) fn choose_engine(&mut self) {
+    /// Replaces `map.engine = "auto"` by what orbits, positions and the other settings of maps allow; orbits that are not known may be any.
+    pub(super) fn choose_engine(&mut self, knows_orbits: bool) {
         if self.map.engine == EngineKind::Auto {
-            let shares_circle = self.array.is_circle() && !self.map.has_pixel_settings();
-            let leaves_circle = self.navigation.has_position_errors() || self.corrects_positions();
-            let is_harmonic = shares_circle && !(leaves_circle && self.has_narrow_limits());
-            let is_harmonic = is_harmonic || self.map.refine.is_on();
+            let is_circle = knows_orbits && self.array.is_circle() && !self.map.has_pixel_settings();
+            let stays = !self.has_narrow_limits() || !self.corrects_positions();
+            let is_harmonic = is_circle && stays || self.map.refine.is_on();
             self.map.engine = if is_harmonic { EngineKind::Harmonic } else { EngineKind::Pixel };
         }
     }

@@ -50,7 +50,7 @@ impl ConfigSource {
     /// As [`Self::parse`].
     #[doc(hidden)]
     pub fn parse_text(&self, text: &str) -> Result<Config, ConfigError> {
-        self.checked(text, self.origin(), |_| Problems::default())
+        self.checked_noting(text, self.origin(), (true, &|_| Problems::default()), &mut Vec::new())
     }
 
     fn text(&self) -> Result<String, ConfigError> {
@@ -80,7 +80,7 @@ impl ConfigSource {
     /// As [`Self::load`].
     #[doc(hidden)]
     pub fn load_noting(&self, notes: &mut Vec<String>) -> Result<Config, ConfigError> {
-        self.checked_noting(&self.text()?, self.origin(), Config::problems, notes)
+        self.checked_noting(&self.text()?, self.origin(), (true, &Config::problems), notes)
     }
 
     /// Reads the file, applies the overrides and checks the values of the ground segment.
@@ -91,26 +91,22 @@ impl ConfigSource {
     /// As [`Self::load`].
     pub fn load_ground(&self) -> Result<Config, ConfigError> {
         match &self.file {
-            Some(_) => self.checked(&self.text()?, self.origin(), Config::ground_problems),
-            None => self.checked("", "default settings".to_owned(), Config::ground_problems),
+            Some(_) => self.checked_ground(&self.text()?, self.origin()),
+            None => self.checked_ground("", "default settings".to_owned()),
         }
     }
 
-    /// Parses `text`, applies the overrides and requires that neither parsing nor `value_problems` finds a problem.
-    fn checked(
-        &self,
-        text: &str,
-        origin: String,
-        value_problems: impl Fn(&Config) -> Problems,
-    ) -> Result<Config, ConfigError> {
-        self.checked_noting(text, origin, value_problems, &mut Vec::new())
+    fn checked_ground(&self, text: &str, origin: String) -> Result<Config, ConfigError> {
+        self.checked_noting(text, origin, (false, &Config::ground_problems), &mut Vec::new())
     }
 
+    /// Parses `text`, applies the overrides and requires that neither parsing nor the check of values finds a problem, of a whole pipeline or
+    /// of a ground segment.
     fn checked_noting(
         &self,
         text: &str,
         origin: String,
-        value_problems: impl Fn(&Config) -> Problems,
+        (is_whole, value_problems): (bool, &dyn Fn(&Config) -> Problems),
         notes: &mut Vec<String>,
     ) -> Result<Config, ConfigError> {
         let mut table = match parse_table(text) {
@@ -147,7 +143,10 @@ impl ConfigSource {
         if partial.config.name.is_empty() {
             partial.config.name = self.default_name();
         }
-        partial.config.choose_engine();
+        // A map file without a space segment, or no file, does not know the orbits.
+        let knows_orbits =
+            is_whole || ["array", "sky", "spacecraft"].iter().any(|name| table.contains_key(*name));
+        partial.config.choose_engine(knows_orbits);
         let found = value_problems(&partial.config).without(|problem| is_of_strength_zero(problem, &table));
         let problems = partial.all_problems(found, override_problems);
         match problems.is_empty() {
@@ -270,19 +269,11 @@ mod tests {
     /// The default pipeline is for any orbits: its engine is one that they allow.
     #[test]
     fn the_embedded_pipeline_takes_any_orbits() {
-        let cases: [(&[&str], EngineKind); 8] = [
+        let cases: [(&[&str], EngineKind); 6] = [
             (&[], EngineKind::Harmonic),
-            // Keys that only pixels have, and positions that leave the circle by metres.
+            // Keys that only pixels have, and positions that calibration moves off the circle.
             (&["map.matrix='free'"], EngineKind::Pixel),
-            (&["navigation.across_m.constant_rms=3.0"], EngineKind::Pixel),
             (&["calibration.hook='solve'", "calibrate.position_sigma_m=10"], EngineKind::Pixel),
-            (
-                &[
-                    "navigation.across_m.constant_rms=3.0",
-                    "map.limits={out_of_track_deg_max=2.0, radial_deg_max=2.0}",
-                ],
-                EngineKind::Harmonic,
-            ),
             (&["array.eccentricity=0.01"], EngineKind::Pixel),
             (&["array.cross_track_ratio=0.1"], EngineKind::Pixel),
             (&["array.eccentricity=0.01", "map.refine.passes_max=3"], EngineKind::Harmonic),
@@ -327,7 +318,10 @@ mod tests {
     fn told(text: &str, overrides: &[&str]) -> Vec<String> {
         let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
         let source = ConfigSource { overrides, ..ConfigSource::default() };
-        let error = source.checked(text, "here".to_owned(), Config::problems).unwrap_err().to_string();
+        let error = source
+            .checked_noting(text, "here".to_owned(), (true, &Config::problems), &mut Vec::new())
+            .unwrap_err()
+            .to_string();
         error.lines().map(str::to_owned).collect()
     }
 
@@ -503,7 +497,8 @@ mod tests {
     #[test]
     fn a_ground_without_a_file_takes_any_number_of_channels() {
         let config = ConfigSource::default().load_ground().unwrap();
-        let map = MapConfig { engine: EngineKind::Harmonic, ..MapConfig::default() };
+        // Of any orbits.
+        let map = MapConfig { engine: EngineKind::Pixel, ..MapConfig::default() };
         assert_eq!((config.map, config.name.as_str()), (map, "lunarray"));
         let told =
             with(&["spacecraft.channels_hz=[3e6]", "map.epsilon=[1e-4, 1e-6, 1e-4]"]).unwrap().problems();

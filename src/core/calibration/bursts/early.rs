@@ -1,8 +1,8 @@
 //! Alerts of bursts while their pass is open.
 //!
 //! The statistics of detection, over the visibilities of a channel so far. Pairs of one daughter may come first, and what is wrong with it is no burst:
-//! alerts wait until none is in more than two thirds of the pairs. A power has to rise above what follows, too, as the Moon's limb makes
-//! steps; so an alert by powers needs half a minute after the burst, one by visibilities nothing but them.
+//! alerts wait until none is in more than half of the pairs, which decide a median. A power has to rise above what follows, too, as the Moon's
+//! limb makes steps; so an alert by powers needs three bins after the burst, one by visibilities nothing but them.
 
 use std::fmt;
 
@@ -15,8 +15,8 @@ use crate::units::Dimension;
 /// Least number of visibilities of a pair so far, for its quartile.
 const VISIBILITIES_MIN: usize = 24;
 
-/// Largest share of the pairs that have the same daughter.
-const SHARE_MAX: f64 = 2.0 / 3.0;
+/// Largest share of the pairs that have the same daughter, of more than three: each of three is in two of three pairs.
+const SHARE_MAX: f64 = 0.5;
 
 /// What may be a burst in a pass that goes on. When the pass has ended it is found, with its direction and flux, or was none.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -59,7 +59,9 @@ pub fn find_alerts(blocks: &[&PlacedVisibilities]) -> Vec<BurstAlert> {
     for pair in pairs.iter().filter_map(|pair| pair.first()).map(|entry| entry.pair()) {
         [pair.i, pair.j].into_iter().for_each(|n| daughters[usize::from(n)] += 1.0);
     }
-    if daughters.into_iter().fold(0.0, f64::max) > SHARE_MAX * pairs.len() as f64 {
+    let present = daughters.iter().filter(|count| **count > 0.0).count();
+    let share = daughters.into_iter().fold(0.0, f64::max) / pairs.len().max(1) as f64;
+    if present > 3 && share > SHARE_MAX || pairs.len() < 3 {
         return Vec::new();
     }
     let Some(bins) = Bins::new(&pairs) else { return Vec::new() };

@@ -87,7 +87,7 @@ pub(super) fn geometry(block: &PlacedVisibilities, k: usize) -> PairGeometry {
 fn motion(block: &PlacedVisibilities, k: usize) -> Vec3 {
     let (before, after) = (k.saturating_sub(1), (k + 1).min(block.len() - 1));
     let s = block.time_s[after] - block.time_s[before];
-    if s > 0.0 && s < MOTION_S_MAX {
+    if s > 0.0 && s < MOTION_S_MAX * (after - before) as f64 {
         scale(s.recip(), sub(baseline(block, after), baseline(block, before)))
     } else {
         [0.0; 3]

@@ -283,8 +283,10 @@ fn judgement(candidate: &Candidate, data: &[Datum]) -> (Matrix, Matrix, f64) {
         }
         let mut from = 0;
         for part in of_pair.chunk_by(|a, b| a.part == b.part) {
-            squares += scores.square(from..from + part.len());
-            (from, sums) = (from + part.len(), sums + 1.0);
+            if let Some(square) = scores.square(from..from + part.len()) {
+                (squares, sums) = (squares + square, sums + 1.0);
+            }
+            from += part.len();
         }
     }
     (inverse(information), variance, (squares / f64::max(sums, 1.0)).max(1.0))
@@ -313,7 +315,11 @@ fn errors(candidate: &Candidate, data: &[Datum], doubt: f64, others: &[(Candidat
     let cosine = dot(longest, candidate.hat).abs() / norm(longest).max(f64::MIN_POSITIVE);
     let bend = cosine / (1.0 - cosine * cosine).max(1e-6).sqrt();
     let sag = 0.75_f64.sqrt() * bend * longer * longer;
-    [longer, shorter.hypot(sag), angle]
+    let across = shorter.hypot(sag).min(1.0);
+    match across > longer {
+        true => [across, longer, (angle + 0.5 * PI).rem_euclid(PI)],
+        false => [longer, across, angle],
+    }
 }
 
 /// What the visibilities of a pair say about a direction.
@@ -356,12 +362,12 @@ impl<'a> Scores<'a> {
     }
 
     /// The squared sum across the fringe of some visibilities, in units of its variance.
-    fn square(&self, range: Range<usize>) -> f64 {
+    fn square(&self, range: Range<usize>) -> Option<f64> {
         let weight = |k: usize| self.weights[k] * self.data[k].power_k_sr;
         let sum: f64 = range.clone().map(|k| weight(k) * self.across[k]).sum();
         let pairs = range.clone().flat_map(|k| range.clone().map(move |l| (k, l)));
         let variance: f64 = pairs.map(|(k, l)| weight(k) * weight(l) * self.covariance(k, l)).sum();
-        if variance > 0.0 { sum * sum / variance } else { 0.0 }
+        (variance > 0.0).then(|| sum * sum / variance)
     }
 }
 

@@ -31,13 +31,6 @@ impl NavigationConfig {
         self.terms().iter().any(|(_, terms)| !terms.is_none())
     }
 
-    /// Whether reported positions have errors.
-    #[must_use]
-    #[doc(hidden)]
-    pub fn has_position_errors(&self) -> bool {
-        [&self.along_m, &self.across_m, &self.radial_m].iter().any(|terms| !terms.is_none())
-    }
-
     /// Whether time tags have errors.
     #[must_use]
     pub fn has_tag_errors(&self) -> bool {

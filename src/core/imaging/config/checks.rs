@@ -27,7 +27,8 @@ impl MapConfig {
             Method::Harmonic | Method::Refined => HARMONIC_ENGINE_NSIDE_MAX,
         };
         let good = is_valid_nside(self.nside) && self.nside <= nside_max;
-        let expected = format!("a power of two from 1 to {nside_max} for this engine");
+        let engine = if is_harmonic { "harmonic" } else { "pixel" };
+        let expected = format!("a power of two from 1 to {nside_max} for map.engine = \"{engine}\"");
         checks.require("nside", self.nside, good, expected);
         let channels = self.channels_max;
         checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");

@@ -96,7 +96,7 @@ keys! {
         /// "harmonic").
         everyday nside: usize = 16;
         /// Map method: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or with map.refine; or
-        /// "auto": "harmonic" if section `array` has a circle, positions keep to it, and no key of pixel maps is set.
+        /// "auto": "harmonic" for a circle of section `array`, unless positions are solved for or a key of pixel maps is set.
         everyday engine: EngineKind = EngineKind::Auto;
         /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
         expert channels_max: usize = 64;

@@ -69,7 +69,14 @@ pub fn solve_pixels_with_power(
         data_count: numbers,
     };
     let hidden = HiddenSky::new(sums);
-    let found = problem.solve_blocks(&|x| Ok(hidden.is_plausible(&to_pixels(x)?)))?;
+    let found = problem.solve_blocks(&|x| {
+        if !watch.may_continue() {
+            return Err(SolveError::Interrupted);
+        }
+        // Mean and dipole are free.
+        let structure = x.iter().zip(&degrees).map(|(x, l)| if *l < 2 { 0.0 } else { *x });
+        Ok(hidden.is_plausible(&to_pixels(&structure.collect::<Vec<f64>>())?))
+    })?;
     let factors = Factors::new(&blocks, &found.regularisation);
     let solved = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
         let mut x = harmonics_of(map)?;
@@ -109,7 +116,7 @@ struct HiddenSky {
 const HIDDEN_WEIGHT: f64 = 0.01;
 /// Least share of hidden pixels for which the map is judged.
 const HIDDEN_SHARE: f64 = 0.02;
-/// A hidden sky that is rougher than the rest by this factor (rms about the mean) is no sky: R expects the same of both, and that where
+/// A hidden sky whose structure (l >= 2) is rougher than that of the rest by this factor (rms) is no sky: R expects the same of both, and that where
 /// nothing is measured the map is smooth.
 const ROUGHER: f64 = 2.0;
 
@@ -130,9 +137,7 @@ impl HiddenSky {
         if (hidden.len() as f64) < HIDDEN_SHARE * map.len() as f64 || seen.is_empty() {
             return true;
         }
-        let mean = seen.iter().sum::<f64>() / seen.len() as f64;
-        let square =
-            |values: &[f64]| values.iter().map(|t| (t - mean).powi(2)).sum::<f64>() / values.len() as f64;
+        let square = |values: &[f64]| dot(values, values) / values.len() as f64;
         square(&hidden) <= ROUGHER.powi(2) * square(&seen)
     }
 }
@@ -264,4 +269,29 @@ fn projected(sums: &PixelSums, harmonics: &Mat<f64>) -> Mat<f64> {
         );
     }
     matrix
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A map of twelve pixels, of which four are hidden.
+    #[test]
+    fn structure_where_nothing_is_seen_is_no_sky() {
+        let hidden = HiddenSky { is_hidden: (0..12).map(|pixel| pixel < 4).collect() };
+        let map = |inside: f64| -> Vec<f64> {
+            (0..12)
+                .map(|pixel| if pixel < 4 { inside } else { 1.0 } * if pixel % 2 == 0 { 1.0 } else { -1.0 })
+                .collect()
+        };
+        assert!(
+            hidden.is_plausible(&map(0.0))
+                && hidden.is_plausible(&map(1.9))
+                && !hidden.is_plausible(&map(2.1))
+        );
+        // Of a sky that is seen everywhere nothing is judged, nor of one that is seen nowhere.
+        for is_hidden in [false, true] {
+            assert!(HiddenSky { is_hidden: vec![is_hidden; 12] }.is_plausible(&map(9.0)));
+        }
+    }
 }

@@ -97,15 +97,17 @@ impl PowerProblem<'_> {
         &self,
         is_plausible: &dyn Fn(&[f64]) -> Result<bool, SolveError>,
     ) -> Result<FoundPower, SolveError> {
-        let mut least = 1.0;
-        for doubling in 0.. {
+        let (mut least, mut first) = (1.0, None);
+        for _ in 0..=DOUBLINGS_MAX {
             let found = self.solve_blocks_in_noise(least)?;
-            if doubling == DOUBLINGS_MAX || is_plausible(&found.solution)? {
+            if is_plausible(&found.solution)? {
                 return Ok(found);
             }
             least = 2.0 * found.noise_factor();
+            first.get_or_insert(found);
         }
-        Err(SolveError::NoPower)
+        // More noise does not help.
+        first.ok_or(SolveError::NoPower)
     }
 
     /// The same with a noise factor of at least `least`.
