@@ -273,7 +273,7 @@ mod tests {
             (&[], EngineKind::Harmonic),
             // Keys that only pixels have, and positions that calibration moves off the circle.
             (&["map.matrix='free'"], EngineKind::Pixel),
-            (&["calibration.hook='solve'", "calibrate.position_sigma_m=10"], EngineKind::Pixel),
+            (&["calibrate.position_sigma_m=10"], EngineKind::Pixel),
             (&["array.eccentricity=0.01"], EngineKind::Pixel),
             (&["array.cross_track_ratio=0.1"], EngineKind::Pixel),
             (&["array.eccentricity=0.01", "map.refine.passes_max=3"], EngineKind::Harmonic),

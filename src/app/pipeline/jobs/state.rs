@@ -211,8 +211,13 @@ mod tests {
     fn settings_of_a_state_are_read_back() {
         let calibration =
             CalibrationConfig { quantiser_bits: 2, sub_bands: 1, ..CalibrationConfig::default() };
-        let pixel =
-            MapConfig { nside: 4, rows: PixelMethod::AverageExact, weight_max: 2e-9, ..MapConfig::default() };
+        let pixel = MapConfig {
+            nside: 4,
+            engine: EngineKind::Pixel,
+            rows: PixelMethod::AverageExact,
+            weight_max: 2e-9,
+            ..MapConfig::default()
+        };
         let limits = GeometryLimits { altitude_m_max: 1e-3, ..GeometryLimits::default() };
         let harmonic = MapConfig { engine: EngineKind::Harmonic, l_max: 7, limits, ..MapConfig::default() };
         let refine = RefineConfig { passes_max: REFINE_ITERATIONS_MAX, ..RefineConfig::default() };
