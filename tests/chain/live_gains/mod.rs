@@ -265,8 +265,11 @@ fn parts_of_ranks_that_solved_alike_are_one_checkpoint() {
     let replay =
         [&["replay", "--map", &mission.place.pipeline, "--out", &out, "--state", &state][..], &sets].concat();
     let map = std::fs::read_to_string(&mission.place.pipeline).unwrap();
-    std::fs::write(&mission.place.pipeline, map.replace("rows = \"centre\"", "engine = \"harmonic\""))
-        .unwrap();
+    std::fs::write(
+        &mission.place.pipeline,
+        map.replace("rows = \"centre\"\n", "").replace("engine = 'pixel'", "engine = 'harmonic'"),
+    )
+    .unwrap();
     succeed(&[&replay[..], &[&mission.file]].concat());
     let checkpoints = || -> Vec<std::path::PathBuf> {
         let found = std::fs::read_dir(&state).unwrap().map(|entry| entry.unwrap().path());
