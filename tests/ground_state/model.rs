@@ -154,6 +154,8 @@ impl Sequence<'_> {
             ground.step(piece, &mut Outlet::collect()).unwrap();
         }
         drop(ground);
+        // A process that is killed leaves its folder, also if nothing but its lock is in there yet.
+        std::fs::create_dir_all(&folder).unwrap();
         match (self.below(3), oldest) {
             (1, Some((path, bytes))) => std::fs::write(path, bytes).unwrap(),
             (2, _) => {

@@ -69,6 +69,9 @@ impl Config {
     /// All problems of a whole pipeline.
     #[must_use]
     pub fn problems(&self) -> Problems {
+        if self.map.engine == EngineKind::Auto {
+            return self.with_chosen_engine(true).problems();
+        }
         let channels = self.spacecraft.channels_hz.len();
         let mut found = Problems::default();
         found.extend(self.sky.problems(channels));
@@ -207,6 +210,12 @@ impl Config {
         }
     }
 
+    fn with_chosen_engine(&self, knows_orbits: bool) -> Self {
+        let mut config = self.clone();
+        config.choose_engine(knows_orbits);
+        config
+    }
+
     /// Requires that `good` holds of a key, whose value a message then has.
     fn require(&self, checks: &mut Checks, key: &str, good: bool, expected: impl Into<Cow<'static, str>>) {
         if !good {
@@ -324,6 +333,9 @@ impl Config {
     #[must_use]
     #[doc(hidden)]
     pub fn ground_problems(&self) -> Problems {
+        if self.map.engine == EngineKind::Auto {
+            return self.with_chosen_engine(false).ground_problems();
+        }
         let mut found = self.ground_value_problems();
         found.append(self.without_effect(&["calibration", "calibrate", "map", "products", "runtime"]));
         found
