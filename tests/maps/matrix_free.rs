@@ -257,7 +257,8 @@ fn an_iteration_says_how_it_ended() {
 
 #[test]
 fn the_key_is_refused_where_it_has_no_effect() {
-    let matrix_free = MapConfig { matrix: MatrixKind::Free, ..MapConfig::default() };
+    let pixels = MapConfig { engine: EngineKind::Pixel, ..MapConfig::default() };
+    let matrix_free = MapConfig { matrix: MatrixKind::Free, ..pixels.clone() };
     let problems = |map: &MapConfig| -> Vec<String> {
         let config = Config { map: map.clone(), ..Config::default() };
         config.ground_problems().iter().map(ToString::to_string).collect()
@@ -281,10 +282,10 @@ fn the_key_is_refused_where_it_has_no_effect() {
             "map.refine",
         ),
         // Without it what only an iteration has is refused, as before.
-        (MapConfig { residual_max: 1e-3, ..MapConfig::default() }, "map.residual_max"),
-        (MapConfig { iterations_max: 9, ..MapConfig::default() }, "map.iterations_max"),
-        (MapConfig { refine, ..MapConfig::default() }, "map.refine"),
-        (MapConfig { nside: 128, ..MapConfig::default() }, "map.nside"),
+        (MapConfig { residual_max: 1e-3, ..pixels.clone() }, "map.residual_max"),
+        (MapConfig { iterations_max: 9, ..pixels.clone() }, "map.iterations_max"),
+        (MapConfig { refine, ..pixels.clone() }, "map.refine"),
+        (MapConfig { nside: 128, ..pixels.clone() }, "map.nside"),
     ] {
         let found = problems(&config);
         assert!(found.len() == 1 && found[0].contains(key), "{key}: {found:?}");

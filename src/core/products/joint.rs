@@ -21,8 +21,8 @@ pub const JOINT: &str = "joint";
 /// What joint maps say of themselves: the content of `joint.json`.
 #[derive(Clone, Debug, Serialize)]
 pub struct JointReport {
-    /// Correlation of the channels; `None` for one alone.
-    pub likeness: Option<Correlation>,
+    /// Correlation of the channels at degrees an octave apart; empty for one channel alone.
+    pub likeness: Vec<Correlation>,
     /// Priors of the total powers; `None` if no channel has any, or they are left out.
     pub power_priors: Option<PowerPriors>,
     /// Iterations of the solution.
@@ -81,7 +81,7 @@ pub fn write_joint(
     let spectra = out.join("spectra.fits");
     solved.spectra.iter().try_for_each(|spectral| write_spectra(&spectra, spectral))?;
     let report = JointReport {
-        likeness: solved.likeness,
+        likeness: solved.likeness.clone(),
         power_priors,
         iterations: solved.convergence.iterations,
         residual: solved.convergence.residual,
@@ -184,11 +184,16 @@ fn write_spectra(path: &Path, found: &SpectralMaps) -> Result<(), ProductsError>
 impl fmt::Display for JointReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut lines = Vec::new();
-        if let Some(Correlation { length, own_share }) = self.likeness {
+        if !self.likeness.is_empty() {
+            let listed = |of: &dyn Fn(&Correlation) -> String| {
+                self.likeness.iter().map(of).collect::<Vec<_>>().join(", ")
+            };
             lines.push(format!(
-            "channels stay alike over {length:.2} e-foldings of frequency; {:.2} % of the power is each channel's own",
-            100.0 * own_share
-        ));
+                "at l = {} channels stay alike over {} e-foldings of frequency; {} % of the power is each channel's own",
+                listed(&|at| at.degree.to_string()),
+                listed(&|at| format!("{:.2}", at.length)),
+                listed(&|at| format!("{:.2}", 100.0 * at.own_share)),
+            ));
         }
         if let Some(PowerPriors { gain, offset, slope, .. }) = &self.power_priors {
             let [gain, offset, slope] = [gain, offset, slope].map(|fraction| 100.0 * fraction);

@@ -5,13 +5,13 @@ use std::ops::RangeInclusive;
 use serde::Serialize;
 
 use super::powers::{PowerAgreement, PowerPriors, PowerRows, WeightedRows};
-use super::prior::{FREE, Prior, View};
+use super::prior::{Prior, View};
 use super::spectrum::{SpectralMaps, SpectrumFit};
 use super::sums::{COUPLED_MAX, JointSums, ScaledBlocks, joint_blocks, joint_coupling, scaled_blocks};
 use crate::imaging::SolveError;
 use crate::imaging::circle::{NOISES_TOGETHER, coefficients, degrees, view_sigma_k};
 use crate::imaging::power::{
-    Block, Coupling, Factors, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE, SkyPower,
+    Block, Coupling, FREE_DEGREES, Factors, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE, SkyPower,
 };
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{Convergence, NamedWatch, StoppingRule, System, dot};
@@ -234,10 +234,10 @@ impl<'a> Posterior<'a> {
     }
 
     /// Amplitudes of the mean and of the dipole (rms of its three coefficients) in each channel, K sr^(1/2).
-    pub(super) fn amplitudes_of_free(&self) -> Vec<[f64; FREE]> {
+    pub(super) fn amplitudes_of_free(&self) -> Vec<[f64; FREE_DEGREES]> {
         let of_channel = |channel: usize| {
             let view = self.prior().view_of(channel);
-            let mut squares = [0.0; FREE];
+            let mut squares = [0.0; FREE_DEGREES];
             for (l, x) in degrees(view.l_max).zip(self.coefficients(&view, &self.solution)) {
                 if let Some(square) = squares.get_mut(l) {
                     *square += x * x / (2 * l + 1) as f64;
@@ -276,7 +276,7 @@ impl<'a> Posterior<'a> {
         for (l, x) in degrees(view.l_max).zip(self.coefficients(view, &self.solution)) {
             square[l] += x * x / (2 * l + 1) as f64;
         }
-        for (l, sigma) in sigma.iter_mut().enumerate().take(FREE) {
+        for (l, sigma) in sigma.iter_mut().enumerate().take(FREE_DEGREES) {
             *sigma = (view.undetermined[l] * square[l]).sqrt();
         }
         sigma
@@ -304,9 +304,8 @@ impl<'a> Posterior<'a> {
         let map_k = synthesis(&coefficients(&sky, view.l_max), nside)?;
         let factors = Factors::new(&self.blocks, &unit_regularisation(self.prior()));
         let row = |channel: usize, l: usize| {
-            let shares = view.shares_of_free.get(l).unwrap_or(&view.shares);
-            let has_unknown = l <= view.l_max && channel < shares.len();
-            if has_unknown { ratio[l].sqrt() * view.scale[l] * shares[channel] } else { 0.0 }
+            let share = view.shares.get(l).and_then(|shares| shares.get(channel));
+            share.map_or(0.0, |share| ratio[l].sqrt() * view.scale[l] * share)
         };
         let undetermined: Vec<f64> =
             self.undetermined_sigma(view).iter().map(|sigma| sigma * sigma).collect();

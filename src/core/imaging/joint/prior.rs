@@ -1,51 +1,15 @@
-//! The prior of the sky's coefficients at several frequencies.
-//!
-//! The coefficients of one degree and order at frequencies nu and nu' are Gaussian with
-//!
-//! ```text
-//! <x(nu) x(nu')> = s_l(nu) s_l(nu') rho(nu, nu'),     s_l^2 = C_l of the single channel,
-//! rho = (1 - p) exp(-(ln nu / nu')^2 / (2 L^2)) + p [nu = nu']
-//! ```
-//!
-//! L is the number of e-foldings of frequency over which the structure is correlated, and p the fraction of power that is independent in each
-//! channel. This covers power laws with curvature at every point, and spectra that turn over.
+//! The prior of the sky's coefficients at several frequencies: `x = T u` with standard normal u, so that `T T'` is their covariance (`correlation`).
 
 use faer::linalg::triangular_solve::solve_upper_triangular_in_place;
-use faer::{Mat, Par, Side};
-use serde::Serialize;
+use faer::{Mat, Par};
 
+use super::correlation::{Correlation, Covariance, Moments};
 use crate::imaging::SolveError;
+use crate::imaging::power::{Derivatives, FREE_DEGREES};
 use crate::imaging::unknowns::{degrees_orders_parts, index_of};
 
-/// Degrees whose prior is free: mean and dipole.
-pub(super) const FREE: usize = 2;
 /// Independent fraction of the free degrees: the smallest for which correlations of close channels have a Cholesky factor.
 const FREE_INDEPENDENT_FRACTION: f64 = 1e-6;
-
-/// The correlation of the sky's structure between frequencies.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Correlation {
-    /// Correlation length L, e-foldings of frequency.
-    pub length: f64,
-    /// Fraction p of a channel's power that is independent of all other channels.
-    pub own_share: f64,
-}
-
-impl Correlation {
-    /// The correlation coefficient of two frequencies.
-    pub(super) fn between(self, a_hz: f64, b_hz: f64) -> f64 {
-        let independent = if a_hz == b_hz { self.own_share } else { 0.0 };
-        (1.0 - self.own_share) * (-0.5 * ((a_hz / b_hz).ln() / self.length).powi(2)).exp() + independent
-    }
-
-    /// The lower Cholesky factor of the channels' correlation matrix; its upper left corner is the factor for the first few channels.
-    pub(super) fn cholesky_factor(self, frequencies_hz: &[f64]) -> Result<Mat<f64>, SolveError> {
-        let count = frequencies_hz.len();
-        let matrix = Mat::from_fn(count, count, |i, j| self.between(frequencies_hz[i], frequencies_hz[j]));
-        let factor = matrix.llt(Side::Lower).map_err(|_| SolveError::NoPower)?;
-        Ok(factor.L().to_owned())
-    }
-}
 
 /// The prior of several channels, `x = T u` with standard normal u. Channels are in order of decreasing l_max, so that the channels with a
 /// given degree come first.
@@ -56,9 +20,9 @@ pub(super) struct Prior {
     pub(super) l_max: Vec<usize>,
     /// s_l of each channel, K sr^(1/2).
     pub(super) scale: Vec<Vec<f64>>,
-    pub(super) likeness: Correlation,
-    /// Lower Cholesky factor of the correlation matrix.
-    factor: Mat<f64>,
+    pub(super) covariance: Covariance,
+    /// By degree, lower Cholesky factor of the channels' covariance in units of their scales.
+    factors: Vec<Mat<f64>>,
 }
 
 /// A map at some frequency as a function of the unknowns: `x_lm = s_l sum_k q_k u_k,lm` plus an undetermined remainder.
@@ -67,28 +31,39 @@ pub(super) struct View {
     pub(super) frequency_hz: f64,
     pub(super) l_max: usize,
     pub(super) scale: Vec<f64>,
-    /// Coefficients q of the channels; at each degree only channels with this degree contribute.
-    pub(super) shares: Vec<f64>,
-    /// Coefficients q for mean and dipole, which have no independent fraction.
-    pub(super) shares_of_free: [Vec<f64>; FREE],
+    /// Coefficients q of the channels by degree; only channels with this degree contribute.
+    pub(super) shares: Vec<Vec<f64>>,
     /// Variance of `x_lm / s_l` that no channel determines, by degree; 0 at the frequency of a channel.
     pub(super) undetermined: Vec<f64>,
 }
 
 impl Prior {
-    pub(super) fn new(
-        frequencies_hz: Vec<f64>,
-        scale: Vec<Vec<f64>>,
-        likeness: Correlation,
-    ) -> Result<Self, SolveError> {
-        let l_max = scale.iter().map(|scale| scale.len() - 1).collect();
-        let factor = likeness.cholesky_factor(&frequencies_hz)?;
-        Ok(Self { frequencies_hz, l_max, scale, likeness, factor })
+    pub(super) fn new(scale: Vec<Vec<f64>>, covariance: Covariance) -> Result<Self, SolveError> {
+        let l_max: Vec<usize> = scale.iter().map(|scale| scale.len() - 1).collect();
+        let of_degree = |l: usize| {
+            if l < FREE_DEGREES {
+                return Ok(Mat::identity(
+                    covariance.frequencies_hz().len(),
+                    covariance.frequencies_hz().len(),
+                ));
+            }
+            let factor = covariance.correlation(l).cholesky_factor(covariance.frequencies_hz())?;
+            let amplitudes = covariance.amplitudes(l);
+            Ok(Mat::from_fn(factor.nrows(), factor.ncols(), |i, j| amplitudes[i] * factor[(i, j)]))
+        };
+        let factors =
+            (0..=l_max.first().copied().unwrap_or(0)).map(of_degree).collect::<Result<_, SolveError>>()?;
+        Ok(Self { frequencies_hz: covariance.frequencies_hz().to_vec(), l_max, scale, covariance, factors })
     }
 
-    /// The same prior with another correlation.
-    pub(super) fn with_correlation(&self, likeness: Correlation) -> Result<Self, SolveError> {
-        Self::new(self.frequencies_hz.clone(), self.scale.clone(), likeness)
+    /// The same prior with other parameters of the covariance.
+    pub(super) fn with_theta(&self, theta: &[f64]) -> Result<Self, SolveError> {
+        Self::new(self.scale.clone(), self.covariance.with_theta(theta))
+    }
+
+    /// Gradient and information of the parameters' log evidence.
+    pub(super) fn derivatives(&self, moments: &[Moments]) -> Derivatives {
+        self.covariance.derivatives(&self.factors, moments)
     }
 
     pub(super) fn channels(&self) -> usize {
@@ -101,8 +76,8 @@ impl Prior {
     }
 
     /// The element of T, without scale, that multiplies the unknowns of channel `source` in the map of `channel`.
-    pub(super) fn share(&self, channel: usize, source: usize) -> f64 {
-        if source <= channel { self.factor[(channel, source)] } else { 0.0 }
+    pub(super) fn share(&self, l: usize, channel: usize, source: usize) -> f64 {
+        if source <= channel { self.factors[l][(channel, source)] } else { 0.0 }
     }
 
     /// The offset of each channel's unknowns, and the total number of unknowns.
@@ -136,7 +111,7 @@ impl Prior {
                 let scaled = self.scale[channel][l] * value;
                 for source in 0..=channel {
                     u[offsets[source] + index_of(self.l_max[source], l, m, part)] +=
-                        self.share(channel, source) * scaled;
+                        self.share(l, channel, source) * scaled;
                 }
             }
         }
@@ -145,13 +120,12 @@ impl Prior {
 
     /// The view at the frequency of a channel.
     pub(super) fn view_of(&self, channel: usize) -> View {
-        let shares: Vec<f64> = (0..=channel).map(|source| self.share(channel, source)).collect();
+        let shares = |l: usize| (0..=channel).map(|source| self.share(l, channel, source)).collect();
         View {
             frequency_hz: self.frequencies_hz[channel],
             l_max: self.l_max[channel],
             scale: self.scale[channel].clone(),
-            shares_of_free: std::array::from_fn(|_| shares.clone()),
-            shares,
+            shares: (0..=self.l_max[channel]).map(shares).collect(),
             undetermined: vec![0.0; self.l_max[channel] + 1],
         }
     }
@@ -160,7 +134,11 @@ impl Prior {
     ///
     /// Mean and dipole have no prior power to scale them, and that of other degrees scatters from channel to channel. So they are given
     /// relative to `free`, amplitudes of mean and dipole in each channel: between channels these follow power laws.
-    pub(super) fn view_at(&self, frequency_hz: f64, free: &[[f64; FREE]]) -> Result<View, SolveError> {
+    pub(super) fn view_at(
+        &self,
+        frequency_hz: f64,
+        free: &[[f64; FREE_DEGREES]],
+    ) -> Result<View, SolveError> {
         if let Some(channel) = self.frequencies_hz.iter().position(|channel_hz| *channel_hz == frequency_hz) {
             return Ok(self.view_of(channel));
         }
@@ -181,37 +159,51 @@ impl Prior {
         let l_max = self.l_max[below].min(self.l_max[above]);
         let [low, high] = [below, above].map(|channel| self.frequencies_hz[channel]);
         let share = (frequency_hz / low).ln() / (high / low).ln();
-        let ln = |channel: usize, l: usize| free[channel].get(l).unwrap_or(&self.scale[channel][l]).ln();
+        let ln = |channel: usize, l: usize| {
+            let own = || self.scale[channel][l] * self.covariance.amplitudes(l)[channel];
+            free[channel].get(l).copied().unwrap_or_else(own).ln()
+        };
         let scale =
             (0..=l_max).map(|l| ((1.0 - share) * ln(below, l) + share * ln(above, l)).exp()).collect();
-        let shares = conditional(&self.factor, self.likeness, &self.frequencies_hz, frequency_hz);
-        let remainder = |shares: &[f64]| (1.0 - shares.iter().map(|q| q * q).sum::<f64>()).max(0.0);
-        let smooth = Correlation { own_share: FREE_INDEPENDENT_FRACTION, ..self.likeness };
-        let factor = smooth.cholesky_factor(&self.frequencies_hz)?;
-        let smooth_shares = conditional(&factor, smooth, &self.frequencies_hz, frequency_hz);
         let of_degree = |l: usize| {
-            if l < FREE {
-                remainder(&smooth_shares)
-            } else {
-                remainder(&shares[..self.channels_with_degree(l)])
-            }
+            let given = &self.frequencies_hz[..self.channels_with_degree(l)];
+            self.between(l, given, frequency_hz, free)
         };
-        let undetermined = (0..=l_max).map(of_degree).collect();
+        let (shares, undetermined) =
+            (0..=l_max).map(of_degree).collect::<Result<Vec<_>, SolveError>>()?.into_iter().unzip();
+        Ok(View { frequency_hz, l_max, scale, shares, undetermined })
+    }
+
+    /// The coefficients q at a frequency between the `given` channels, and the variance that they leave.
+    fn between(
+        &self,
+        l: usize,
+        given: &[f64],
+        frequency_hz: f64,
+        free: &[[f64; FREE_DEGREES]],
+    ) -> Result<(Vec<f64>, f64), SolveError> {
+        let own = self.covariance.correlation(l);
+        let correlation =
+            if l < FREE_DEGREES { Correlation { own_share: FREE_INDEPENDENT_FRACTION, ..own } } else { own };
+        let factor = correlation.cholesky_factor(given)?;
+        let shares = conditional(&factor, correlation, given, frequency_hz);
+        let left = (1.0 - shares.iter().map(|q| q * q).sum::<f64>()).max(0.0);
+        if l >= FREE_DEGREES {
+            return Ok((shares, left));
+        }
         // q' factor^-1 are the coefficients of the channels' maps; they are converted to coefficients of the unknowns.
-        let mut map_weights = Mat::from_fn(smooth_shares.len(), 1, |k, _| smooth_shares[k]);
+        let mut map_weights = Mat::from_fn(shares.len(), 1, |k, _| shares[k]);
         solve_upper_triangular_in_place(factor.as_ref().transpose(), map_weights.as_mut(), Par::Seq);
         // An amplitude that all channels have is that of frequencies between them, too, as it is free: shares of it add up to one.
         let total: f64 = map_weights.col(0).iter().sum();
-        let of_unknown = |l: usize, source: usize| {
+        let of_unknown = |source: usize| {
             let of_channel = |channel: usize| {
                 let relative = self.scale[channel][l] / free[channel][l];
-                map_weights[(channel, 0)] / total * relative * self.share(channel, source)
+                map_weights[(channel, 0)] / total * relative * self.share(l, channel, source)
             };
             (0..self.channels()).map(of_channel).sum()
         };
-        let shares_of_free =
-            std::array::from_fn(|l| (0..self.channels()).map(|source| of_unknown(l, source)).collect());
-        Ok(View { frequency_hz, l_max, scale, shares, shares_of_free, undetermined })
+        Ok(((0..self.channels()).map(of_unknown).collect(), left))
     }
 }
 
@@ -222,9 +214,8 @@ impl View {
             let of_channel = |(channel, q): (usize, &f64)| {
                 q * u[offsets[channel] + index_of(prior.l_max[channel], l, m, part)]
             };
-            let shares = self.shares_of_free.get(l).unwrap_or(&self.shares);
             let sum: f64 =
-                shares.iter().enumerate().take(prior.channels_with_degree(l)).map(of_channel).sum();
+                self.shares[l].iter().enumerate().take(prior.channels_with_degree(l)).map(of_channel).sum();
             self.scale[l] * sum
         };
         degrees_orders_parts(self.l_max).map(of_unknown).collect()
@@ -234,17 +225,23 @@ impl View {
     pub(super) fn truncated(mut self, l_max: usize) -> Self {
         self.l_max = self.l_max.min(l_max);
         self.scale.truncate(self.l_max + 1);
+        self.shares.truncate(self.l_max + 1);
         self.undetermined.truncate(self.l_max + 1);
         self
     }
 }
 
 /// The coefficients `q = factor^-1 rho` of the unknowns at a frequency, by forward substitution.
-fn conditional(factor: &Mat<f64>, likeness: Correlation, channels_hz: &[f64], frequency_hz: f64) -> Vec<f64> {
+fn conditional(
+    factor: &Mat<f64>,
+    correlation: Correlation,
+    channels_hz: &[f64],
+    frequency_hz: f64,
+) -> Vec<f64> {
     let mut shares: Vec<f64> = Vec::new();
     for (channel, channel_hz) in channels_hz.iter().enumerate() {
         let known: f64 = shares.iter().enumerate().map(|(source, q)| q * factor[(channel, source)]).sum();
-        shares.push((likeness.between(*channel_hz, frequency_hz) - known) / factor[(channel, channel)]);
+        shares.push((correlation.between(*channel_hz, frequency_hz) - known) / factor[(channel, channel)]);
     }
     shares
 }
@@ -255,7 +252,7 @@ mod tests {
 
     fn prior() -> Prior {
         let scale = vec![vec![3.0, 2.0, 1.0, 0.5], vec![6.0, 4.0, 2.5], vec![1.0, 1.0, 1.0]];
-        Prior::new(vec![10e6, 5e6, 20e6], scale, Correlation { length: 1.5, own_share: 0.01 }).unwrap()
+        Prior::new(scale, Covariance::constant(vec![10e6, 5e6, 20e6], 3, 1.5, 0.01)).unwrap()
     }
 
     /// Compares T T' with the covariance of the prior, element by element.
@@ -271,8 +268,8 @@ mod tests {
                     let at = |channel: usize| index_of(prior.l_max[channel], l, m, part);
                     let found: f64 = columns.iter().map(|sky| sky[a][at(a)] * sky[b][at(b)]).sum();
                     let ln_ratio = f64::ln(a_hz / b_hz);
-                    let correlation =
-                        0.99 * (-ln_ratio * ln_ratio / 4.5).exp() + if a == b { 0.01 } else { 0.0 };
+                    let alike = if l < 2 { 0.0 } else { 0.99 * (-ln_ratio * ln_ratio / 4.5).exp() };
+                    let correlation = if a == b { 1.0 } else { alike };
                     let expected = prior.scale[a][l] * prior.scale[b][l] * correlation;
                     assert!((found - expected).abs() < 1e-12, "{a} {b} {l}: {found} {expected}");
                 }
@@ -295,9 +292,9 @@ mod tests {
     /// Compares with the explicit formulas of conditional Gaussians for two channels.
     #[test]
     fn a_frequency_between_is_the_most_likely_given_its_neighbours() {
-        let likeness = Correlation { length: 1.0, own_share: 0.0 };
-        let prior = Prior::new(vec![4e6, 9e6], vec![vec![2.0; 3], vec![1.0; 3]], likeness).unwrap();
-        let free = [[2.0; FREE], [1.0; FREE]];
+        let covariance = Covariance::constant(vec![4e6, 9e6], 2, 1.0, 1e-15);
+        let prior = Prior::new(vec![vec![2.0; 3], vec![1.0; 3]], covariance).unwrap();
+        let free = [[2.0; FREE_DEGREES], [1.0; FREE_DEGREES]];
         let view = prior.view_at(6e6, &free).unwrap();
         let (r, q) = ((-0.5 * (9.0_f64 / 4.0).ln().powi(2)).exp(), (-0.5 * 1.5_f64.ln().powi(2)).exp());
         // rho' C^-1 rho for rho = (q, q), C = (1 r; r 1).
@@ -315,17 +312,17 @@ mod tests {
         let law = |hz: f64| (hz / 1e7).powf(-2.5);
         let scale = |(hz, scatter): (&f64, f64)| vec![1e3 * scatter * law(*hz); 3];
         let scale = frequencies_hz.iter().zip(scatter).map(scale).collect();
-        let likeness = Correlation { length: 1.5, own_share: 0.01 };
-        let prior = Prior::new(frequencies_hz.clone(), scale, likeness).unwrap();
+        let covariance = Covariance::constant(frequencies_hz.clone(), 2, 1.5, 0.01);
+        let prior = Prior::new(scale, covariance).unwrap();
         let (offsets, count) = prior.offsets();
         // Unknowns of which the channels' means are the law, by forward substitution.
         let mut u = vec![0.0; count];
         for channel in 0..prior.channels() {
-            let share = |source: usize| prior.share(channel, source) * prior.scale[channel][0];
+            let share = |source: usize| prior.share(0, channel, source) * prior.scale[channel][0];
             let known: f64 = (0..channel).map(|source| share(source) * u[offsets[source]]).sum();
             u[offsets[channel]] = (law(frequencies_hz[channel]) - known) / share(channel);
         }
-        let free: Vec<[f64; FREE]> = frequencies_hz.iter().map(|hz| [law(*hz), 1.0]).collect();
+        let free: Vec<[f64; FREE_DEGREES]> = frequencies_hz.iter().map(|hz| [law(*hz), 1.0]).collect();
         for hz in [4e6, 7e6, 9e6] {
             let view = prior.view_at(hz, &free).unwrap();
             let found = view.coefficients(&prior, &offsets, &u)[0];

@@ -1,30 +1,22 @@
-//! Estimates the correlation between channels, then solves for all channels together.
+//! Estimates the covariance between channels, then solves for all channels together.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
+use super::correlation::{Correlation, Covariance};
+use super::evidence::most_likely;
 use super::posterior::{Equations, JointMap, JointRequest, Posterior};
 use super::powers::{PowerRows, PowerSample};
-use super::prior::{Correlation, FREE, Prior, View};
+use super::prior::{Prior, View};
 use super::spectrum::SpectralMaps;
-use super::sums::{ScaledBlocks, joint_blocks, scaled_blocks};
+use super::sums::scaled_blocks;
 use crate::imaging::SolveError;
 use crate::imaging::circle::{HarmonicSums, OrderBlocks, degrees};
-use crate::imaging::power::{Block, Coupling, FoundPower, PowerProblem, SkyPower, log_evidence};
+use crate::imaging::power::{Block, Coupling, FREE_DEGREES, FoundPower, PowerProblem, SkyPower};
 use crate::imaging::solver::{Convergence, NamedWatch, SolveWatch, StoppingRule};
 use crate::imaging::{AccumulationError, NormalSums, SumCounts};
 
-/// Correlation lengths of the initial grid.
-const LENGTHS: [f64; 5] = [0.5, 1.0, 2.0, 4.0, 8.0];
-/// Independent fractions of the initial grid.
-const OWN_SHARES: [f64; 4] = [1e-4, 1e-3, 1e-2, 1e-1];
-/// Factor to which the parameters are determined.
-const FACTOR_MIN: f64 = 1.05;
-/// Bounds of the search, beyond which the evidence does not change.
-const LENGTH_MAX: f64 = 64.0;
-const OWN_SHARE_RANGE: [f64; 2] = [1e-7, 0.999];
 /// Prior power of the free degrees in units of that of l = 2.
-const FREE_FACTORS: [f64; FREE] = [1e6, 1e4];
+const FREE_FACTORS: [f64; FREE_DEGREES] = [1e6, 1e4];
 
 /// A channel with its own solution.
 pub struct JointChannel {
@@ -90,8 +82,8 @@ impl JointChannel {
 /// A joint solution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointSolution {
-    /// Correlation between channels; `None` for one alone.
-    pub likeness: Option<Correlation>,
+    /// Correlation between channels at degrees an octave apart; empty for one channel alone.
+    pub likeness: Vec<Correlation>,
     /// Maps at all frequencies, in increasing order.
     pub maps: Vec<JointMap>,
     /// Spectral index and curvature of every pixel; `None` for a channel alone.
@@ -111,7 +103,7 @@ struct SingleChannel {
 /// Solves for the maps of all channels together.
 ///
 /// `T(nu)` and the noise of each channel are Gaussian. The angular power of each channel is estimated from its own data as for a single map,
-/// and the correlation between channels from all blocks together, by maximum evidence.
+/// and the covariance between channels by degree from all blocks together, by maximum evidence.
 ///
 /// # Errors
 /// There is no data, or one channel without total powers, or two of one frequency; or a frequency is outside the range of the channels.
@@ -129,17 +121,17 @@ pub fn solve_jointly(
     let blocks: Vec<Vec<Block<'_>>> = channels.iter().map(|channel| channel.blocks.blocks()).collect();
     let singles = || channels.iter().map(|channel| &channel.alone);
     let noise_factors: Vec<f64> = singles().map(|single| single.power.noise_factor).collect();
-    let scale = singles().map(SingleChannel::scale).collect();
-    let initial = Prior::new(all_hz, scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
+    let scale: Vec<Vec<f64>> = singles().map(SingleChannel::scale).collect();
+    let l_max = channels.first().map_or(0, JointChannel::l_max);
+    let mut prior = Prior::new(scale, Covariance::initial(all_hz, l_max))?;
     let watch = watch.named("all channels").of_final_map(true);
-    let likeness = if channels.len() > 1 {
-        let scaled = scaled_blocks(&initial, &blocks, &noise_factors, &[]);
+    let mut likeness = Vec::new();
+    if channels.len() > 1 {
+        let scaled = scaled_blocks(&prior, &blocks, &noise_factors, &[]);
         let rights: Vec<Vec<f64>> = singles().map(|single| single.right.clone()).collect();
-        Some(most_likely(&initial, &scaled, &rights, watch)?)
-    } else {
-        None
-    };
-    let prior = initial.with_correlation(likeness.unwrap_or(initial.likeness))?;
+        prior = most_likely(&prior, &scaled, &rights, watch)?;
+        likeness = prior.covariance.at_knots();
+    }
     let rows = power_rows(&channels, request)?;
     let sums: Vec<&(dyn NormalSums + Sync)> =
         channels.iter().map(|channel| &channel.sums as &(dyn NormalSums + Sync)).collect();
@@ -230,52 +222,4 @@ impl SingleChannel {
             |(l, own): (usize, &f64)| FREE_FACTORS.get(l).map_or(*own, |factor| factor * structure);
         power.iter().enumerate().map(of_degree).map(f64::sqrt).collect()
     }
-}
-
-/// The correlation of maximum evidence, by a search on a coarse grid and then in smaller and smaller steps.
-pub(super) fn most_likely(
-    initial: &Prior,
-    scaled: &[ScaledBlocks],
-    rights: &[Vec<f64>],
-    watch: NamedWatch<'_>,
-) -> Result<Correlation, SolveError> {
-    let mut known: BTreeMap<[u64; 2], f64> = BTreeMap::new();
-    let task = watch.start("correlation between channels", FACTOR_MIN);
-    let mut evidence = |likeness: Correlation| -> Option<f64> {
-        let key = [likeness.length.to_bits(), likeness.own_share.to_bits()];
-        if let Some(found) = known.get(&key) {
-            return Some(*found);
-        }
-        let prior = initial.with_correlation(likeness).ok()?;
-        let blocks = joint_blocks(&prior, scaled);
-        let unit = vec![1.0; initial.l_max.first().map_or(1, |l_max| l_max + 1)];
-        let found = log_evidence(&blocks, &unit, &prior.transposed(rights))?;
-        known.insert(key, found);
-        Some(found)
-    };
-    let grid = LENGTHS
-        .iter()
-        .flat_map(|length| OWN_SHARES.iter().map(|own| Correlation { length: *length, own_share: *own }));
-    let found = grid.filter_map(|likeness| Some((evidence(likeness)?, likeness)));
-    let (mut best, mut position) = found.max_by(|a, b| a.0.total_cmp(&b.0)).ok_or(SolveError::NoPower)?;
-    let mut factor: f64 = 2.0;
-    let mut step = 0;
-    while factor > FACTOR_MIN && task.report_step(true, step, factor) {
-        step += 1;
-        // Both parameters change together, because the evidence has a diagonal ridge.
-        let moves = [factor.recip(), 1.0, factor];
-        let steps: Vec<(f64, f64)> = moves.iter().flat_map(|a| moves.map(|b| (*a, b))).collect();
-        let tried = steps.iter().filter_map(|(length, own)| {
-            let likeness = Correlation {
-                length: (position.length * length).min(LENGTH_MAX),
-                own_share: (position.own_share * own * own).clamp(OWN_SHARE_RANGE[0], OWN_SHARE_RANGE[1]),
-            };
-            Some((evidence(likeness)?, likeness))
-        });
-        match tried.max_by(|a, b| a.0.total_cmp(&b.0)) {
-            Some((found, likeness)) if found > best => (best, position) = (found, likeness),
-            _ => factor = factor.sqrt(),
-        }
-    }
-    Ok(position)
 }

@@ -181,10 +181,13 @@ fn joint_block(prior: &Prior, scaled: &ScaledBlocks, offsets: &[usize]) -> Block
         for b in 0..=a {
             // Channel c depends on the unknowns of channels up to c, at its own degrees.
             for c in a..sizes.len() {
-                let share = prior.share(c, a) * prior.share(c, b);
+                let shares = |source: usize| -> Vec<f64> {
+                    (0..sizes[c]).map(|k| prior.share(m + parity + 2 * k, c, source)).collect()
+                };
+                let (rows, columns) = (shares(a), shares(b));
                 for j in 0..sizes[c] {
                     for i in 0..sizes[c] {
-                        matrix[(first[a] + i, first[b] + j)] += share * of_channel[c][(i, j)];
+                        matrix[(first[a] + i, first[b] + j)] += rows[i] * of_channel[c][(i, j)] * columns[j];
                     }
                 }
             }
@@ -252,16 +255,19 @@ pub(super) fn joint_coupling(
             let at = |degree: usize| -> Vec<usize> {
                 unknowns().map(|(l, m, part)| index_of(degree, l, m, part)).collect()
             };
-            let scale: Vec<f64> = unknowns().map(|(l, ..)| prior.scale[channel][l] / factor).collect();
+            let scale = |source: usize| -> Vec<f64> {
+                let of_degree = |l: usize| prior.share(l, channel, source) * prior.scale[channel][l] / factor;
+                unknowns().map(|(l, ..)| of_degree(l)).collect()
+            };
             let own = at(coupling.degree_max);
             for a in 0..=channel {
                 for b in 0..=channel {
-                    let share = prior.share(channel, a) * prior.share(channel, b);
                     let (rows, columns) = (at(degrees[a]), at(degrees[b]));
+                    let (of_row, of_column) = (scale(a), scale(b));
                     for (j, column) in columns.iter().enumerate() {
                         for (i, row) in rows.iter().enumerate() {
                             matrix[(first[a] + row, first[b] + column)] +=
-                                share * scale[i] * coupling.matrix[(own[i], own[j])] * scale[j];
+                                of_row[i] * coupling.matrix[(own[i], own[j])] * of_column[j];
                         }
                     }
                 }
@@ -279,14 +285,14 @@ fn count_up_to(degrees: &[usize]) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::imaging::joint::prior::Correlation;
+    use crate::imaging::joint::correlation::Covariance;
 
     /// The product with the blocks equals successive products with T, the channels' blocks and `T'`.
     #[test]
     fn blocks_are_the_channels_blocks_between_t_and_its_transpose() {
         let scale = vec![vec![1.0, 0.5, 0.3, 0.2], vec![2.0, 1.5, 0.7], vec![1.2, 0.9, 0.4]];
-        let likeness = Correlation { length: 2.0, own_share: 0.05 };
-        let prior = Prior::new(vec![3e6, 10e6, 5e6], scale, likeness).unwrap();
+        let covariance = Covariance::constant(vec![3e6, 10e6, 5e6], 3, 2.0, 0.05);
+        let prior = Prior::new(scale, covariance).unwrap();
         let factors = [1.0, 1.5, 1.2];
         let of = |channel: usize| -> Vec<Block<'static>> {
             let l_max = prior.l_max[channel];
@@ -327,8 +333,8 @@ mod tests {
     #[test]
     fn coupling_is_the_channels_couplings_between_t_and_its_transpose() {
         let scale = vec![vec![1.0, 0.5, 0.3, 0.2], vec![2.0, 1.5, 0.7], vec![1.2, 0.9, 0.4]];
-        let likeness = Correlation { length: 2.0, own_share: 0.05 };
-        let prior = Prior::new(vec![10e6, 3e6, 5e6], scale, likeness).unwrap();
+        let covariance = Covariance::constant(vec![10e6, 3e6, 5e6], 3, 2.0, 0.05);
+        let prior = Prior::new(scale, covariance).unwrap();
         let factors = [1.0, 1.5, 1.2];
         let of = |channel: usize, degree_max: usize| {
             let count = (degree_max + 1).pow(2);

@@ -6,11 +6,12 @@ use faer::linalg::solvers::{DenseSolveCore, Solve};
 use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 
+use super::correlation::Covariance;
+use super::evidence::{evidence, moments, most_likely};
 use super::posterior::{Equations, JointRequest, Posterior};
 use super::powers::{PowerPriors, PowerRows, PowerSample};
-use super::prior::{Correlation, Prior, View};
-use super::solve::most_likely;
-use super::sums::{JointSums, scaled_blocks};
+use super::prior::{Prior, View};
+use super::sums::{JointSums, ScaledBlocks, scaled_blocks};
 use crate::imaging::SkyPower;
 use crate::imaging::circle::{coefficients, degrees};
 use crate::imaging::power::Block;
@@ -117,7 +118,9 @@ fn posterior_of_dense(scales: [&Vec<f64>; 3], channels: &[Dense; 2]) -> (Mat<f64
             return 0.0;
         }
         let x = f64::ln(hz[a] / hz[b]) / 0.8;
-        scales[a][l] * scales[b][l] * (0.98 * (-0.5 * x * x).exp() + if a == b { 0.02 } else { 0.0 })
+        // Mean and dipole of each channel are free.
+        let alike = if l < 2 { 0.0 } else { 0.98 * (-0.5 * x * x).exp() };
+        scales[a][l] * scales[b][l] * if a == b { 1.0 } else { alike }
     });
     let (first, second) = (25, 16);
     let a = Mat::from_fn(count, count, |i, j| {
@@ -141,9 +144,9 @@ fn posterior_of_dense(scales: [&Vec<f64>; 3], channels: &[Dense; 2]) -> (Mat<f64
 
 /// The channels' scales, their prior, and their noise factors.
 fn two_channels() -> (Vec<Vec<f64>>, Prior, Vec<f64>) {
-    let likeness = Correlation { length: 0.8, own_share: 0.02 };
+    let covariance = Covariance::constant(vec![10e6, 5e6], 4, 0.8, 0.02);
     let scale = vec![vec![3.0, 2.0, 1.0, 0.7, 0.5], vec![5.0, 4.0, 2.0, 1.0]];
-    (scale.clone(), Prior::new(vec![10e6, 5e6], scale, likeness).unwrap(), vec![1.0, 1.3])
+    (scale.clone(), Prior::new(scale, covariance).unwrap(), vec![1.0, 1.3])
 }
 
 /// Compares solution, variances and an intermediate frequency with `(A + C^-1)^-1 b` from dense matrices, without T. `expected` are the
@@ -404,8 +407,8 @@ fn errors_of_the_mean_hold_with_unknown_gains() {
         constrained: vec![],
         noise_factor: 1.0,
     };
-    let prior =
-        Prior::new(vec![10e6], vec![scale.clone()], Correlation { length: 1.0, own_share: 0.5 }).unwrap();
+    let covariance = Covariance::constant(vec![10e6], 4, 1.0, 0.5);
+    let prior = Prior::new(vec![scale.clone()], covariance).unwrap();
     let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.01, constant_k_sr: Vec::new() };
     let deviations: Vec<f64> = (0..TRIALS)
         .map(|trial| {
@@ -469,36 +472,75 @@ fn errors_of_the_mean_hold_with_unknown_gains() {
     assert!(bias.abs() < 3.0 / (TRIALS as f64).sqrt(), "{bias}");
 }
 
-/// The correlation of simulated skies is recovered.
-#[test]
-fn the_correlation_of_the_sky_is_found() {
-    let truth = Correlation { length: 1.4, own_share: 0.03 };
+/// Skies of three channels with parameters that change with degree, each coefficient measured with an error of 0.01: their prior, a start of
+/// the search, its blocks and right-hand sides.
+fn simulated(l_max: usize) -> (Prior, Prior, Vec<ScaledBlocks>, Vec<Vec<f64>>) {
     let frequencies_hz = vec![4e6, 6e6, 9e6];
-    let scale = vec![vec![1.0; 11]; 3];
-    let prior = Prior::new(frequencies_hz, scale, truth).unwrap();
+    let start = Covariance::constant(frequencies_hz, l_max, 2.0, 1e-2);
+    let plain = Prior::new(vec![vec![1.0; l_max + 1]; 3], start).unwrap();
+    let per_knot = 5;
+    let knots = plain.covariance.theta.len() / per_knot;
+    // From l = 2 on L falls, p rises, and the amplitude of the last channel is 0.7 of that of its own C_l.
+    let of_knot = |knot: usize| [0.6 - 0.2 * knot as f64, -5.0 + knot as f64, 0.0, 0.0, 0.7_f64.ln()];
+    let theta: Vec<f64> = (0..knots).flat_map(of_knot).collect();
+    let truth = plain.with_theta(&theta).unwrap();
     let mut normal = normal(5);
-    let (_, count) = prior.offsets();
+    let (_, count) = truth.offsets();
     let unit: Vec<f64> = (0..count).map(|_| normal()).collect();
-    // Each coefficient is measured separately with an error of 0.01, so A = 1e4.
-    let rights: Vec<Vec<f64>> = prior
-        .skies(&unit)
-        .into_iter()
-        .map(|sky| sky.into_iter().map(|x| 1e4 * x + 1e2 * normal()).collect())
-        .collect();
-    let plain = prior.with_correlation(Correlation { length: 2.0, own_share: 1e-3 }).unwrap();
+    let measured = |sky: Vec<f64>| sky.into_iter().map(|x| 1e4 * x + 1e2 * normal()).collect();
+    let rights: Vec<Vec<f64>> = truth.skies(&unit).into_iter().map(measured).collect();
     let of = |(m, parity): (usize, usize)| {
-        let degrees: Vec<usize> = (m + parity..=10).step_by(2).collect();
+        let degrees: Vec<usize> = (m + parity..=l_max).step_by(2).collect();
         let n = degrees.len();
         let matrix = Cow::Owned(Mat::from_fn(n, n, |i, j| if i == j { 1e4 } else { 0.0 }));
-        let place = |part| degrees.iter().map(|l| index_of(10, *l, m, part)).collect();
+        let place = |part| degrees.iter().map(|l| index_of(l_max, *l, m, part)).collect();
         Block { matrix, places: (0..if m == 0 { 1 } else { 2 }).map(place).collect(), degrees }
     };
-    let orders = (0..=10).flat_map(|m| [(m, 0), (m, 1)]).filter(|(m, parity)| m + parity <= 10);
+    let orders = (0..=l_max).flat_map(|m| [(m, 0), (m, 1)]).filter(|(m, parity)| m + parity <= l_max);
     let blocks: Vec<Block<'_>> = orders.map(of).collect();
     let scaled = scaled_blocks(&plain, &[blocks.clone(), blocks.clone(), blocks], &[1.0; 3], &[]);
+    (truth, plain, scaled, rights)
+}
+
+/// The gradient of evidence and prior is that of their differences.
+#[test]
+fn derivatives_of_the_evidence_are_its_differences() {
+    let (truth, _, scaled, rights) = simulated(11);
+    let theta = &truth.covariance.theta;
+    let value = |theta: &[f64]| {
+        let prior = truth.with_theta(theta).unwrap();
+        evidence(&prior, &scaled, &rights).unwrap() + prior.covariance.hyperprior().value
+    };
+    let (gradient, information) = truth.derivatives(&moments(&truth, &scaled, &rights).unwrap());
+    for k in 0..theta.len() {
+        let moved = |by: f64| {
+            let mut moved = theta.clone();
+            moved[k] += by;
+            value(&moved)
+        };
+        // The error of the difference is the third derivative, some thousand, times 1e-8.
+        let difference = (moved(1e-4) - moved(-1e-4)) / 2e-4;
+        assert!((gradient[k] - difference).abs() < 1e-3, "{k}: {} {difference}", gradient[k]);
+        assert!(information[(k, k)] > 0.0);
+    }
+}
+
+/// Correlation and amplitudes of simulated skies are recovered, degree by degree.
+#[test]
+fn the_covariance_of_the_sky_is_found() {
+    let (truth, plain, scaled, rights) = simulated(47);
     let watch = SolveWatch::default();
     let found = most_likely(&plain, &scaled, &rights, watch.named("test")).unwrap();
-    // With 121 modes a single parameter's logarithm has an error of sqrt(2 / 121) = 0.13; three times that, and the last step.
-    assert!((found.length / truth.length).ln().abs() < 0.5, "{found:?}");
-    assert!((found.own_share / truth.own_share).ln().abs() < 0.8, "{found:?}");
+    let (found, truth) = (&found.covariance, &truth.covariance);
+    // From l = 8 there are 100 modes or more for each parameter, whose logarithms so have errors of sqrt(2 / 100) = 0.14; that of L is found from
+    // 1 less the correlation, which p shares. Three times these.
+    for l in [8, 12, 24, 47] {
+        let (a, b) = (found.correlation(l), truth.correlation(l));
+        assert!((a.length / b.length).ln().abs() < 0.5, "{a:?} {b:?}");
+        assert!((a.own_share / b.own_share).ln().abs() < 0.8, "{a:?} {b:?}");
+        // The amplitude's error is half of that of a power.
+        for (a, b) in found.amplitudes(l).into_iter().zip(truth.amplitudes(l)) {
+            assert!((a / b).ln().abs() < 0.2, "{l} {a} {b}");
+        }
+    }
 }

@@ -21,6 +21,12 @@ pub(in crate::imaging) struct Block<'a> {
     pub(in crate::imaging) places: Vec<Vec<usize>>,
 }
 
+/// The posterior of a block's unknowns.
+pub(in crate::imaging) struct BlockPosterior {
+    pub(in crate::imaging) mean: Mat<f64>,
+    pub(in crate::imaging) covariance: Mat<f64>,
+}
+
 /// The log evidence of a power, and its derivatives.
 pub(super) struct Evidence {
     /// `1/2 b.(A + R)^-1 b + 1/2 ln det R - 1/2 ln det(A + R)`.
@@ -94,6 +100,12 @@ impl Block<'_> {
         let matrix = Mat::from_fn(order.len(), order.len(), |i, j| self.matrix[(order[i], order[j])]);
         let degrees = order.iter().map(|k| self.degrees[*k]).collect();
         Block { matrix: Cow::Owned(matrix), degrees, places: Vec::new() }
+    }
+
+    /// Mean, by row and part, and covariance of the unknowns for a right-hand side; `None` if the block is not positive definite.
+    pub(in crate::imaging) fn posterior(&self, r: &[f64], right: &[f64]) -> Option<BlockPosterior> {
+        let factor = self.factor(r)?;
+        Some(BlockPosterior { mean: factor.solve(&self.gather(right)), covariance: factor.inverse() })
     }
 
     fn gather(&self, unknowns: &[f64]) -> Mat<f64> {

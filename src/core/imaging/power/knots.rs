@@ -5,7 +5,7 @@ use faer::Mat;
 /// Degree of the first knot; lower degrees are free.
 pub(super) const FIRST: usize = 2;
 /// Number of degrees with a free prior: mean and dipole do not follow the power of structure.
-pub(super) const FREE_DEGREES: usize = FIRST;
+pub(in crate::imaging) const FREE_DEGREES: usize = FIRST;
 /// Prior power of monopole and dipole in units of the power at [`FIRST`]: far more than of any sky.
 const FREE_FACTORS: [f64; FREE_DEGREES] = [1e6, 1e4];
 /// Prior mean of the fall of ln C_l from knot to knot: the sky between 1 and 100 MHz falls as `l^-2` to `l^-3.5` at all scales.
@@ -23,7 +23,7 @@ const LIMIT_SIGMA: f64 = 0.1;
 
 /// The knots for degrees up to `l_max`.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Knots {
+pub(in crate::imaging) struct Knots {
     l_max: usize,
     count: usize,
     /// Initial ln C_l of the first knot.
@@ -31,21 +31,26 @@ pub(super) struct Knots {
 }
 
 /// The logarithm of the parameters' prior, with its derivatives.
-pub(super) struct Hyperprior {
-    pub(super) value: f64,
-    pub(super) gradient: Vec<f64>,
+pub(in crate::imaging) struct Hyperprior {
+    pub(in crate::imaging) value: f64,
+    pub(in crate::imaging) gradient: Vec<f64>,
     /// The negative second derivative.
-    pub(super) precision: Mat<f64>,
+    pub(in crate::imaging) precision: Mat<f64>,
 }
 
 impl Knots {
-    pub(super) fn new(l_max: usize, level: f64) -> Self {
+    pub(in crate::imaging) fn new(l_max: usize, level: f64) -> Self {
         let octaves = ((l_max + 1) as f64 / (FIRST + 1) as f64).log2().ceil().max(1.0);
         Self { l_max, count: octaves as usize + 1, level }
     }
 
-    pub(super) fn count(&self) -> usize {
+    pub(in crate::imaging) fn count(&self) -> usize {
         self.count
+    }
+
+    /// The degree of a knot.
+    pub(in crate::imaging) fn degree(knot: usize) -> usize {
+        ((FIRST + 1) << knot) - 1
     }
 
     /// The initial parameters: `C_l` proportional to `(l + 1)^-2`, with `level` at the first knot.
@@ -54,7 +59,7 @@ impl Knots {
     }
 
     /// The knots on both sides of a degree with their weights, which are 0 for a free degree.
-    pub(super) fn weights(&self, l: usize) -> [(usize, f64); 2] {
+    pub(in crate::imaging) fn weights(&self, l: usize) -> [(usize, f64); 2] {
         if l < FREE_DEGREES {
             return [(0, 0.0), (0, 0.0)];
         }
@@ -81,11 +86,7 @@ impl Knots {
 
     /// The prior of the parameters.
     pub(super) fn hyperprior(&self, theta: &[f64]) -> Hyperprior {
-        let mut prior = Hyperprior {
-            value: 0.0,
-            gradient: vec![0.0; self.count],
-            precision: Mat::zeros(self.count, self.count),
-        };
+        let mut prior = Hyperprior::flat(self.count);
         prior.add(&[(0, 1.0)], theta[0] - self.level, LEVEL_SIGMA);
         for k in 1..self.count {
             let terms = [(k - 1, -1.0), (k, 1.0)];
@@ -107,8 +108,13 @@ impl Knots {
 }
 
 impl Hyperprior {
+    /// No knowledge of this many parameters.
+    pub(in crate::imaging) fn flat(count: usize) -> Self {
+        Self { value: 0.0, gradient: vec![0.0; count], precision: Mat::zeros(count, count) }
+    }
+
     /// Adds a Gaussian prior of width `sigma` for the linear combination `terms`, which deviates from its mean by `deviation`.
-    fn add(&mut self, terms: &[(usize, f64)], deviation: f64, sigma: f64) {
+    pub(in crate::imaging) fn add(&mut self, terms: &[(usize, f64)], deviation: f64, sigma: f64) {
         let weight = sigma.powi(-2);
         self.value -= 0.5 * weight * deviation * deviation;
         for &(k, factor) in terms {

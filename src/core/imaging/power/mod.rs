@@ -18,6 +18,7 @@
 mod blocks;
 mod gibbs;
 mod knots;
+mod newton;
 mod rounds;
 mod samples;
 #[cfg(test)]
@@ -30,25 +31,17 @@ use faer::{Mat, Side};
 use serde::Serialize;
 
 pub(super) use blocks::{Block, Coupling, Factors, log_evidence, multiply};
+pub(super) use knots::{FREE_DEGREES, Hyperprior, Knots};
+pub(super) use newton::{Derivatives, maximise};
 pub(super) use rounds::{FoundPower, MapsWithPower, PowerProblem};
 pub(super) use samples::{PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE};
 
 use self::blocks::{evidence, largest_diagonal};
-use self::knots::{FREE_DEGREES, Knots};
 use crate::imaging::SolveError;
 use crate::sky::healpix::pixel_count;
 
 /// Decades of amplitude that are searched, in units of the smallest noise variance.
 const DECADES: std::ops::RangeInclusive<i32> = -3..=13;
-/// Maximum number of steps of Newton's iteration.
-const STEPS_MAX: usize = 20;
-/// Gain in evidence per step below which the iteration ends.
-const GAIN_MIN: f64 = 1e-4;
-/// Maximum change of ln C_l in one step.
-const STEP_MAX: f64 = 2.0;
-/// Maximum number of halvings of a step without gain.
-const HALVINGS: usize = 8;
-
 /// Limit of the `V'N^-1V` that C_l predicts for degrees from 2 on, in units of that of the data. Rounds of data that leave most of the sky open
 /// could otherwise run away: a larger C_l makes a larger map, which makes a larger C_l. Beyond it a narrow Gaussian prior in the logarithm sets in.
 const EXPECTED_MAX: f64 = 30.0;
@@ -376,37 +369,19 @@ impl PowerFit {
 
     /// Maximises the objective by Newton's iteration.
     pub(super) fn maximised(&self, data: BlockData<'_>) -> Result<Self, SolveError> {
-        let mut fit = self.clone();
-        let mut best = fit.objective(&fit.theta, data).ok_or(SolveError::NoPower)?;
-        for _ in 0..STEPS_MAX {
-            let (gradient, mut information) = fit.derivatives(data).ok_or(SolveError::NoPower)?;
+        let at = |theta: &[f64]| Self::new(self.knots.clone(), theta.to_vec(), self.limit.clone());
+        let derivatives = |theta: &[f64]| {
+            let fit = at(theta);
+            let (gradient, mut information) = fit.derivatives(data)?;
             let slopes = fit.limit_slopes();
             for (j, a) in slopes.iter().enumerate() {
                 slopes.iter().enumerate().for_each(|(k, b)| information[(j, k)] += a * b);
             }
-            let Ok(factor) = information.llt(Side::Lower) else { break };
-            let covariance = factor.inverse();
-            let mut step: Vec<f64> = (0..gradient.len())
-                .map(|k| gradient.iter().enumerate().map(|(j, g)| covariance[(k, j)] * g).sum())
-                .collect();
-            let longest = step.iter().fold(0.0_f64, |longest, step| longest.max(step.abs()));
-            if longest > STEP_MAX {
-                step.iter_mut().for_each(|step| *step *= STEP_MAX / longest);
-            }
-            let improved = (0..HALVINGS).find_map(|halving| {
-                let share = 0.5_f64.powi(halving as i32);
-                let theta: Vec<f64> = fit.theta.iter().zip(&step).map(|(t, s)| t + share * s).collect();
-                let found = fit.objective(&theta, data).filter(|found| *found > best)?;
-                Some((found, theta))
-            });
-            let Some((found, theta)) = improved else { break };
-            let gain = found - best;
-            (best, fit) = (found, Self::new(fit.knots, theta, fit.limit));
-            if gain < GAIN_MIN {
-                break;
-            }
-        }
-        Ok(fit)
+            Some((gradient, information))
+        };
+        let found =
+            maximise(self.theta.clone(), &|theta| self.objective(theta, data), &derivatives, &|_, _| true);
+        found.map(|theta| at(&theta)).ok_or(SolveError::NoPower)
     }
 
     /// Maximum change of ln C_l at a knot.
