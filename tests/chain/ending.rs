@@ -9,7 +9,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use super::common::process::{end, hidden, output, signal, start, wait_until, written};
-use super::common::workplace::{SMALL, Workplace, succeed};
+use super::common::workplace::{SMALL, Workplace, files, succeed};
 
 /// Far more than the slowest machine needs from a signal to the end, far less than what is interrupted would take.
 const SOON: Duration = Duration::from_secs(60);
@@ -241,4 +241,24 @@ fn nobody_reads_and_nothing_panics() {
             assert!(!said.contains("panicked"), "{args:?}: {said}");
         }
     }
+}
+
+#[test]
+fn interrupted_samples_leave_the_state_and_say_so() {
+    let place = Workplace::new(&SMALL.replace("epsilon = 1e-4", "").replace("engine = 'pixel'", ""));
+    let file = place.simulate("all.ccsds", &[]);
+    let (state, maps, out) = (place.path("state"), place.path("maps"), place.path("samples"));
+    succeed(&["replay", &file, "--map", &place.pipeline, "--state", &state, "--out", &maps]);
+    let before = files(Path::new(&state));
+    // Hours.
+    let mut child = start(&["sample", &state, "--count", "10000", "--gibbs", "--out", &out]);
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(|line| line.unwrap());
+    // The first line of progress comes after seconds.
+    assert!(lines.any(|line| line.contains("of 10000")), "it has ended by itself");
+    signal(&child, "INT");
+    let (status, took) = end(&mut child);
+    assert_eq!(status.code(), Some(130), "{status:?}");
+    assert!(took < SOON, "{took:?}");
+    assert!(lines.any(|line| line.contains("ended early: samples of 0 channels")));
+    assert!(!Path::new(&out).exists() && files(Path::new(&state)) == before);
 }

@@ -114,7 +114,10 @@ power_constant_k_sr = [2e4, 0.0, 1e4]
 
 /// A few windows of three channels with total powers.
 fn few_windows(section: &str) -> Workplace {
-    let channels = "[7.0e6, 5.0e6, 6.0e6]\nauto_powers = true\nauto_integration_s = 100.0";
+    few_windows_of("[7.0e6, 5.0e6, 6.0e6]\nauto_powers = true\nauto_integration_s = 100.0", section)
+}
+
+fn few_windows_of(channels: &str, section: &str) -> Workplace {
     let changes = [
         ("[5.0e6, 7.0e6, 10.0e6]", channels),
         ("nside = 32", "nside = 4"),
@@ -171,6 +174,32 @@ fn joint_maps_of_a_run_may_leave_out_powers() {
     let off = ["--set", "joint.on=false", "--set", "joint.powers=true"];
     succeed(&[&["run", &place.pipeline, "--out", &place.path("run")], &off[..]].concat());
     assert_eq!(files(), [false; 3]);
+}
+
+#[test]
+fn states_and_options_that_do_not_fit_are_refused() {
+    let place = few_windows_of("[7.0e6, 5.0e6, 6.0e6]", "");
+    let file = place.simulate("all.ccsds", &[]);
+    let [one, other, out] = ["one", "other", "out"].map(|name| place.path(name));
+    for state in [&one, &other] {
+        succeed(&["replay", &file, "--map", &place.pipeline, "--state", state, "--out", &out]);
+    }
+    let refused = |words: &[&str], expected: &str| {
+        let joint = place.path("joint");
+        let said = fail(&[&["joint", &one], words, &["--out", &joint]].concat());
+        assert!(said.contains(expected), "{words:?}: {said}");
+        assert!(!Path::new(&joint).join("joint.json").exists(), "{words:?}");
+    };
+    refused(&[&format!("{one}/")], "the state is given twice; expected each state once");
+    refused(&[&other], "7.000 MHz is in ");
+    refused(&["--power-priors", "5,1,1"], "--power-priors has no effect, as there are no total powers in ");
+    refused(&["--power-constant-k-sr", "5"], "--power-constant-k-sr has no effect");
+    refused(&["--no-powers"], "--no-powers has no effect");
+    refused(&["--no-powers", "--power-priors", "5,1,1"], "cannot be used with");
+    // What a few samples tell of errors is told, too: 1 / sqrt(2 * 8) = 0.25.
+    let joint = place.path("few");
+    let report = json(&["joint", &one, "--set", "map.residual_max=1e-2", "--count", "8", "--out", &joint]);
+    assert_eq!((report["samples"].as_u64(), report["sigma_uncertainty"].as_f64()), (Some(8), Some(0.25)));
 }
 
 #[test]

@@ -4,7 +4,7 @@
 //! a folder imports only folders before it in [`ORDER`], and the ground nothing of the spacecraft; neither files nor the parts of a folder
 //! (its files, and folders as wholes) import each other in a circle.
 //!
-//! [`lengths`] has the longest a function may be, [`public`] how many items the library shows, [`book`] what links may lead to.
+//! [`lengths`] has the longest a function may be, [`messages`] what errors may show, [`public`] how many items the library shows, [`book`] what links may lead to.
 //!
 //! An import is a `use` or a path in the code. It is followed through `pub use` to the file that defines the item, so
 //! that a re-export neither hides an import nor makes one. Code under `#[cfg(test)]` is free.
@@ -12,6 +12,7 @@
 
 mod book;
 mod lengths;
+mod messages;
 mod public;
 mod rules;
 mod source;

@@ -98,6 +98,7 @@ fn checked(args: &CheckArgs) -> Result<(Plan, Cost), CommandError> {
     print_notes(sky_notes(&plan)?);
     let cost = plan.cost_with_ranks(ranks).on_nodes(args.pipeline.memory_limit());
     cost.require_finite()?;
+    print_notes(plan.baseline_note(&cost, Segment::Whole));
     Ok((plan, cost))
 }
 

@@ -72,10 +72,13 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     }
     use_threads(&plan.config.runtime)?;
     let out = args.out.clone().map_or_else(|| default_out(&plan.config.name), Ok)?;
+    let cost = plan.cost_with_ranks(job.ranks().share().count);
+    if job.is_first() {
+        print_notes(plan.baseline_note(&cost, Segment::Whole));
+    }
     if let Some(size) = args.groups {
         return in_groups(args, &plan, size, &out);
     }
-    let cost = plan.cost_with_ranks(job.ranks().share().count);
     cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "whole", None, None)?;

@@ -1,17 +1,19 @@
 //! `lunarray sample`: maps of a state's sums that are as likely as its map.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::Args;
 use serde::Serialize;
 
 use super::arguments::{StateMapArgs, output_path};
-use super::output::{CommandResult, Completion, print_json_line, print_text};
+use super::interrupt::Interrupt;
+use super::output::{CommandError, CommandResult, print_json_line, print_notes, print_text};
 use super::progress::while_solving;
 use crate::files::write_atomically;
-use crate::imaging::{RegulariserChoice, Sample, Samples, Solution, SolveWatch};
-use crate::pipeline::{sample_state, use_threads};
-use crate::products::{ErrorMap, own_power_csv, told_vector};
+use crate::imaging::{RegulariserChoice, Sample, Samples, Solution, SolveError, SolveWatch};
+use crate::pipeline::{PipelineError, sample_state, use_threads};
+use crate::products::{ErrorMap, own_power_csv, sigma_uncertainty, told_vector, uncertainty_line};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
 use crate::units::frequency_folder;
@@ -24,7 +26,7 @@ const COUNT_MAX: u64 = 10_000;
 /// They scatter around the map by its errors, from noise and from scales that the data do not measure: so does whatever is computed from
 /// each of them. Needs R from the data (map.regulariser = "data"). Leaves in the output folder, for each channel, the map, each sample,
 /// sigma.fits (standard deviation of each pixel), mask.fits and resolution.fits as of maps, and spectrum.csv, the sky's angular power with
-/// its 68 % interval. No visibility is read again, and the state stays as it is.
+/// its 68 % interval. No visibility is read again, and the state stays as it is. Ctrl-C ends it with the channels that are finished.
 ///
 /// Example: lunarray sample state/ --count 100 --out samples/
 #[derive(Debug, Args)]
@@ -53,6 +55,8 @@ pub(super) struct SampleArgs {
 struct SampledChannel {
     frequency_hz: f64,
     samples: usize,
+    /// Relative standard deviation of a standard deviation of samples: 1 / sqrt(2 samples).
+    sigma_uncertainty: f64,
     mean_k: f64,
     /// Standard deviation of the samples' means.
     mean_sigma_k: f64,
@@ -86,32 +90,55 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     }
     use_threads(&config.runtime)?;
     let mut written = Vec::new();
+    let interrupt = Interrupt::default();
+    interrupt.arm_or_note();
+    let watch = SolveWatch::new(interrupt.cancel().clone()).with_grace(Duration::ZERO);
     let mut take = |solution: Solution| written.push(write(args, &solution));
-    let watch = SolveWatch::default();
     let samples = Samples { count: args.count as usize, gibbs: args.gibbs };
-    while_solving(&watch, || sample_state(&args.state, &config, samples, &watch, &mut take))?;
+    let found = while_solving(&watch, || sample_state(&args.state, &config, samples, &watch, &mut take));
+    let is_cut_short = matches!(&found, Err(PipelineError::Solve(SolveError::Interrupted)));
+    if !is_cut_short {
+        found?;
+    }
     let mut all = Vec::new();
     for sampled in written {
         all.push(sampled?);
     }
-    if args.json {
-        print_json_line(&all)?;
-        return Ok(Completion::Done);
+    if is_cut_short {
+        print_notes([format!(
+            "ended early: samples of {} channels are in {}, others are not made; the state is as it was",
+            all.len(),
+            args.out.display()
+        )]);
     }
-    let line = |sampled: &SampledChannel| {
-        format!(
-            "{:>8.3} MHz  {} samples in {}: mean ({:.4e} +- {:.1e}) K, dipole {} K, pixels +- {:.2e} K rms",
-            sampled.frequency_hz / 1e6,
-            sampled.samples,
-            sampled.folder,
-            sampled.mean_k,
-            sampled.mean_sigma_k,
-            told_vector(sampled.dipole_k, sampled.dipole_sigma_k),
-            sampled.sigma_rms_k
-        )
-    };
-    print_text(&all.iter().map(line).collect::<Vec<_>>().join("\n"))?;
-    Ok(Completion::Done)
+    interrupt.completion(is_cut_short).after(args.print(&all))
+}
+
+impl SampleArgs {
+    fn print(&self, all: &[SampledChannel]) -> Result<(), CommandError> {
+        if self.json {
+            return print_json_line(&all);
+        }
+        if all.is_empty() {
+            return Ok(());
+        }
+        let mut lines: Vec<String> = all.iter().map(line).collect();
+        lines.push(uncertainty_line("mean, dipole and pixels", self.count as usize));
+        print_text(&lines.join("\n"))
+    }
+}
+
+fn line(sampled: &SampledChannel) -> String {
+    format!(
+        "{:>8.3} MHz  {} samples in {}: mean ({:.4e} +- {:.1e}) K, dipole {} K, pixels +- {:.2e} K rms",
+        sampled.frequency_hz / 1e6,
+        sampled.samples,
+        sampled.folder,
+        sampled.mean_k,
+        sampled.mean_sigma_k,
+        told_vector(sampled.dipole_k, sampled.dipole_sigma_k),
+        sampled.sigma_rms_k
+    )
 }
 
 fn write(
@@ -156,6 +183,7 @@ fn write(
     Ok(SampledChannel {
         frequency_hz,
         samples: errors.samples.len(),
+        sigma_uncertainty: sigma_uncertainty(errors.samples.len()),
         mean_k,
         mean_sigma_k: scatter(&|sample| mean_of(&sample.map_k), mean_k).sqrt(),
         dipole_k,

@@ -88,10 +88,12 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     print_notes(plan.array.notes());
     print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
+    let cost = plan.cost();
+    print_notes(plan.baseline_note(&cost, Segment::Space));
     if let (Some(size), Some(out)) = (args.groups, &args.out) {
         return in_groups(args, &plan, size, out);
     }
-    plan.cost().require_memory(Segment::Space, args.pipeline.memory_limit())?;
+    cost.require_memory(Segment::Space, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "space", None, None)?;
     let cancel = interrupt.cancel();

@@ -163,8 +163,8 @@ fn table(summary: &StudySummary) -> String {
     let widest =
         summary.cases.iter().map(|case| case.figures.label.chars().count()).max().unwrap_or(4).max(4);
     let mut lines = vec![format!(
-        "{:<widest$}  {:>10}  {:>12}  {:>9}  {:>10}  {:>10}  {:>10}",
-        "case", "MHz", "visibilities", "epsilon", "noise, K", "Tr Sigma_n", "Tr Sigma_s"
+        "{:<widest$}  {:>8}  {:>10}  {:>12}  {:>9}  {:>10}  {:>10}  {:>10}",
+        "case", "engine", "MHz", "visibilities", "epsilon", "noise, K", "Tr Sigma_n", "Tr Sigma_s"
     )];
     for case in &summary.cases {
         for channel in &case.figures.channels {
@@ -172,8 +172,9 @@ fn table(summary: &StudySummary) -> String {
             let [n, s] = [traces.map(|t| t.sigma_n_k2.value), traces.map(|t| t.sigma_s.value)]
                 .map(|value| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.3e}")));
             lines.push(format!(
-                "{:<widest$}  {:>10.3}  {:>12}  {:>9}  {:>10.3e}  {n:>10}  {s:>10}",
+                "{:<widest$}  {:>8}  {:>10.3}  {:>12}  {:>9}  {:>10.3e}  {n:>10}  {s:>10}",
                 case.figures.label,
+                case.figures.engine.as_deref().unwrap_or("-"),
                 channel.frequency_hz / 1e6,
                 channel.visibilities,
                 channel

@@ -148,10 +148,8 @@ fn channel_values(
     });
     let beam = figures.and_then(|figures| figures.beam.as_ref());
     let projected_m = |which: usize| coverage.map(|coverage| (coverage.projected_m[which], Computed));
-    let estimated_deg = || {
-        let (longest_m, _) = projected_m(1)?;
-        Some(((SPEED_OF_LIGHT_M_S / frequency_hz / longest_m).to_degrees(), Estimated))
-    };
+    let fringe_deg = projected_m(1)
+        .map(|(longest_m, source)| ((SPEED_OF_LIGHT_M_S / frequency_hz / longest_m).to_degrees(), source));
     let (mapped, all) = (plan.visibilities()[channel].mapped, whole.visibilities()[channel].sent);
     let mut values = vec![
         row("frequency", "MHz", Some((frequency_hz / 1e6, Set))),
@@ -163,11 +161,16 @@ fn channel_values(
         ),
         row("shortest projected baseline", "m", projected_m(0)),
         row("longest projected baseline", "m", projected_m(1)),
-        row("coverage, most / least", "", coverage.map(|coverage| (coverage.most_over_least, Computed))),
+        row("finest fringe: wavelength / longest projected baseline", "deg", fringe_deg),
         row(
-            "resolution",
+            "observing time of directions, most / least",
+            "",
+            coverage.map(|coverage| (coverage.most_over_least, Computed)),
+        ),
+        row(
+            "resolution: FWHM of the effective beam",
             "deg",
-            beam.and_then(|beam| beam.fwhm_deg).map_or_else(estimated_deg, |deg| Some((deg, Measured))),
+            beam.and_then(|beam| beam.fwhm_deg).map(|deg| (deg, Measured)),
         ),
         row("noise of a pixel", "K", figures.map(|figures| (figures.noise_rms_k, Measured))),
         row("noise per beam", "Jy", beam.and_then(|beam| beam.noise_rms_jy).map(|noise| (noise, Measured))),
@@ -274,7 +277,7 @@ fn mark(source: ValueSource) -> &'static str {
 }
 
 const KEY: &str = "c: follows from the orbits; e: estimated without a map; m: measured in a simulated run; without a letter: a setting. \
-                   Baselines, coverage, noise, rho, SNR and measured modes are those of the part of the visibilities in the map, data and times of the whole mission. Resolution is the FWHM of the effective beam, estimated as the wavelength over the longest projected baseline.";
+                   Baselines, coverage, noise, rho, SNR and measured modes are those of the part of the visibilities in the map, data and times of the whole mission. Estimates of rho, SNR and measured modes use baselines up to 5 wavelengths alone, and are too low where few are so short, at 10 MHz up to four times. The effective beam is measured in a map; it is not the finest fringe that the baselines see.";
 
 /// The table as Markdown, a row a quantity.
 #[must_use]

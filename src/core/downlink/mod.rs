@@ -55,6 +55,6 @@ pub use transport::{DownlinkReader, DownlinkWriter, FileSource};
 pub use transport::{Pace, PacedSource, Recorder, Steps, Transmitter};
 #[doc(hidden)]
 pub use wire::{
-    CucTime, FORMAT_VERSION, Format, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, PacketKind, PacketSegment,
-    Packetizer, TRAILER_BYTES, Transmission,
+    COUNT_MAX, CucTime, FORMAT_VERSION, Format, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, PacketKind,
+    PacketSegment, Packetizer, TRAILER_BYTES, Transmission,
 };

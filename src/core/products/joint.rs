@@ -31,6 +31,10 @@ pub struct JointReport {
     pub residual: f64,
     /// Whether it reached `map.residual_max`.
     pub converged: bool,
+    /// Number of posterior samples, from which errors of means and spectra are.
+    pub samples: usize,
+    /// Relative standard deviation of those errors: 1 / sqrt(2 samples).
+    pub sigma_uncertainty: f64,
     /// The maps, in order of frequency.
     pub maps: Vec<JointMapReport>,
     /// File of spectral index and curvature; `None` for a channel alone.
@@ -86,6 +90,8 @@ pub fn write_joint(
         iterations: solved.convergence.iterations,
         residual: solved.convergence.residual,
         converged: solved.convergence.converged,
+        samples: solved.samples,
+        sigma_uncertainty: sigma_uncertainty(solved.samples),
         maps,
         spectra: solved.spectra.is_some().then(|| spectra.display().to_string()),
     };
@@ -94,6 +100,21 @@ pub fn write_joint(
         .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
     write_product(&path, text)?;
     Ok(report)
+}
+
+/// Relative standard deviation of a standard deviation that is the scatter of Gaussian samples about a known mean.
+#[must_use]
+pub fn sigma_uncertainty(samples: usize) -> f64 {
+    (2.0 * samples as f64).sqrt().recip()
+}
+
+/// A sentence on the uncertainty of errors of `what`.
+#[must_use]
+pub fn uncertainty_line(what: &str, samples: usize) -> String {
+    let percent = 100.0 * sigma_uncertainty(samples);
+    format!(
+        "errors of {what}, from {samples} samples, are uncertain by {percent:.0} %: 1 / sqrt(2 N) of N samples"
+    )
 }
 
 fn write_map(
@@ -220,6 +241,7 @@ impl fmt::Display for JointReport {
                 map.folder
             ));
         }
+        lines.push(uncertainty_line("means and spectra", self.samples));
         lines.extend(self.spectra.iter().map(|path| format!("spectral index and curvature: {path}")));
         if !self.converged {
             lines.push(format!(
@@ -228,5 +250,19 @@ impl fmt::Display for JointReport {
             ));
         }
         f.write_str(&lines.join("\n"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_of_few_samples_are_uncertain() {
+        // Of N Gaussian numbers about a known mean, the variance has the relative variance 2 / N, and its root a quarter of that.
+        for (samples, percent) in [(2, "50 %"), (8, "25 %"), (16, "18 %"), (200, "5 %")] {
+            let line = uncertainty_line("means", samples);
+            assert!(line.contains(&format!("from {samples} samples, are uncertain by {percent}")), "{line}");
+        }
     }
 }

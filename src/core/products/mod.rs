@@ -52,7 +52,7 @@ pub use error_maps::{ErrorMap, own_power_csv, told_vector};
 #[doc(hidden)]
 pub use hips::{Hips, HipsReport};
 #[doc(hidden)]
-pub use joint::{JOINT, JointMapReport, JointReport, write_joint};
+pub use joint::{JOINT, JointMapReport, JointReport, sigma_uncertainty, uncertainty_line, write_joint};
 #[doc(hidden)]
 pub use latitudes::LatitudeError;
 #[doc(hidden)]

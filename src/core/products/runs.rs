@@ -17,6 +17,9 @@ pub struct RunFigures {
     pub label: String,
     /// Whether the run was cancelled.
     pub cancelled: bool,
+    /// The engine of its maps, also where `map.engine = "auto"` chose it; `None` if it is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub engine: Option<String>,
     /// Figures of each channel.
     pub channels: Vec<ChannelFigures>,
 }
@@ -286,7 +289,7 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
     let mut text =
         "run,frequency_hz,nside,visibilities,epsilon,w_max,mean_k,input_mean_k,noise_rms_k,tr_sigma_n_k2,\
                     tr_sigma_n_error_k2,tr_sigma_s,tr_sigma_s_error,rho_mean_20_120,beam_fwhm_deg,noise_rms_jy_beam,\
-                    cl_ratio_20_120,coherent_power_20_120\n"
+                    cl_ratio_20_120,coherent_power_20_120,engine\n"
             .to_owned();
     for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
         let DiagnosticFigures { epsilon, w_max, traces, .. } = &channel.diagnostics;
@@ -315,7 +318,8 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
             cl_ratio,
             coherent,
         ];
-        let fields: Vec<String> = start.into_iter().chain(numbers.map(number)).collect();
+        let engine = run.engine.clone().unwrap_or_default();
+        let fields: Vec<String> = start.into_iter().chain(numbers.map(number)).chain([engine]).collect();
         text.push_str(&fields.join(","));
         text.push('\n');
     }
@@ -387,7 +391,12 @@ pub(super) mod tests {
             latitudes: None,
             power_kept: None,
         };
-        RunFigures { label: label.to_owned(), cancelled: false, channels: vec![channel] }
+        RunFigures {
+            label: label.to_owned(),
+            cancelled: false,
+            engine: Some("pixel".to_owned()),
+            channels: vec![channel],
+        }
     }
 
     #[test]
@@ -426,6 +435,7 @@ pub(super) mod tests {
         assert!(
             lines[1].starts_with("\"b < b_p, \"\"all\"\"\",10000000,8,5,1e-4,2e0,9.5e0,1e1,5e-1,3e0,,5e-1,,")
         );
+        assert!(lines[0].ends_with(",engine") && lines[1].ends_with(",pixel"), "{table}");
         let spectra = spectra_csv(&all);
         assert_eq!(spectra.lines().nth(2).unwrap(), "\"b < b_p, \"\"all\"\"\",10000000,1,,,,,2e0,1e0,,,");
         for text in [&table, &spectra] {

@@ -278,6 +278,17 @@ pub enum PipelineError {
         /// Its value for none.
         none: &'static str,
     },
+    /// Two states of a joint map hold one frequency.
+    #[error(
+        "{:.3} MHz is in {} and in {}; expected each frequency in one state: `lunarray replay` of all downlinks into one state adds their data",
+        frequency_hz / 1e6, states[0].display(), states[1].display()
+    )]
+    SameFrequency {
+        /// Frequency, Hz.
+        frequency_hz: f64,
+        /// Folders of the states.
+        states: [std::path::PathBuf; 2],
+    },
     /// A run that cannot be done group by group.
     #[error("--groups: found {found}, expected {expected}")]
     NotInGroups {

@@ -1,6 +1,7 @@
 //! Estimated cost of a plan before it runs: operations, bytes, memory and time; groups of channels that fit into memory.
 
 mod advice;
+mod baselines;
 mod estimate;
 mod groups;
 mod model_plans;

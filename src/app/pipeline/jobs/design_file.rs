@@ -224,11 +224,17 @@ impl DesignFile {
             return Err((format!("evaluations = {}", self.evaluations), "1 to 10000"));
         }
         let DesignLimits { closest_m_min, span_m_min, span_m_max, keeping_m_s_per_year_max } = self.limits;
-        let limits = [Some(closest_m_min), Some(span_m_min), span_m_max, keeping_m_s_per_year_max];
-        if !limits.iter().flatten().all(|limit| limit.is_finite() && *limit >= 0.0) {
-            return Err((format!("{:?}", self.limits), "limits that are not negative"));
+        let limits = [
+            ("closest_m_min", Some(closest_m_min)),
+            ("span_m_min", Some(span_m_min)),
+            ("span_m_max", span_m_max),
+            ("keeping_m_s_per_year_max", keeping_m_s_per_year_max),
+        ];
+        let set = limits.into_iter().filter_map(|(key, limit)| Some((key, limit?)));
+        match set.into_iter().find(|(_, limit)| !(limit.is_finite() && *limit >= 0.0)) {
+            Some((key, limit)) => Err((format!("limits.{key} = {limit}"), "limits that are not negative")),
+            None => Ok(()),
         }
-        Ok(())
     }
 
     /// What was found and expected instead, of the first parameter or limit that tells nothing of the estimates of a plan.

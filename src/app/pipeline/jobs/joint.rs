@@ -1,6 +1,6 @@
 //! Joint maps of the channels of one or more states.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::frames::Instrument;
 use crate::ground::{Ground, GroundConfig, WAIT_BYTES};
@@ -31,6 +31,19 @@ pub fn solve_states_jointly(
     Ok(solve_jointly(channels, &request, watch)?)
 }
 
+/// Whether any of some states holds total powers of the daughters.
+///
+/// # Errors
+/// A folder without a usable state, or in use.
+pub fn has_powers(states: &[PathBuf]) -> Result<bool, PipelineError> {
+    for folder in states {
+        if Ground::channels_in(folder)?.is_some_and(|(.., has_powers)| has_powers) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 /// The channels of one or more states, each with its own solution, and with their total powers if the request has priors for them.
 ///
 /// A state is read several times if memory does not hold the sums of all its channels; those that do not fit are moved to disk.
@@ -48,6 +61,7 @@ pub fn joint_channels(
         require_joint_settings(folder, config)?;
         of_states.push(MappedChannels::new(Ground::channels_in(folder)?, config));
     }
+    require_different_frequencies(states, &of_states)?;
     // Two channels of one frequency are an error if both have sums. Powers are not known yet: with them one channel suffices.
     let mut frequencies_hz: Vec<f64> =
         of_states.iter().flat_map(|state| state.hz_with_sums.clone()).collect();
@@ -66,6 +80,9 @@ pub fn joint_channels(
         let channels = [with_sums, others].concat();
         let mut left = &channels[..];
         loop {
+            if watch.is_cancelled() {
+                return Err(SolveError::Interrupted.into());
+            }
             let (group, later) = left.split_at(kept.next_count().min(left.len()));
             left = later;
             let group: ChannelGroup = group.iter().copied().collect();
@@ -76,6 +93,26 @@ pub fn joint_channels(
         }
     }
     Ok(kept.channels)
+}
+
+/// Requires that no frequency has sums in two states.
+fn require_different_frequencies(
+    states: &[(&Path, Config)],
+    of_states: &[MappedChannels],
+) -> Result<(), PipelineError> {
+    let folder =
+        |number: usize| states.get(number).map_or_else(PathBuf::new, |(folder, _)| folder.to_path_buf());
+    for (number, state) in of_states.iter().enumerate() {
+        for &frequency_hz in &state.hz_with_sums {
+            let before =
+                of_states[..number].iter().position(|other| other.hz_with_sums.contains(&frequency_hz));
+            if let Some(before) = before {
+                let states = [before, number].map(folder);
+                return Err(PipelineError::SameFrequency { frequency_hz, states });
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Requires that nothing is set for the maps of a state that joint maps would leave out.
@@ -109,6 +146,9 @@ fn read(
             Some(_) => powers_of(&all_powers, &instrument, frequency_hz)?,
             None => Vec::new(),
         };
+        if watch.is_cancelled() {
+            return Err(SolveError::Interrupted.into());
+        }
         kept.keep(JointChannel::new((frequency_hz, nside), *sums, powers, request.rule, watch)?)?;
     }
     Ok(())
@@ -124,9 +164,10 @@ struct MappedChannels {
 }
 
 impl MappedChannels {
-    fn new(found: Option<(Instrument, Vec<bool>)>, config: &Config) -> Self {
-        let (channels, has_sums) = found
-            .map_or_else(Default::default, |(instrument, has_sums)| (instrument.frequencies_hz(), has_sums));
+    fn new(found: Option<(Instrument, Vec<bool>, bool)>, config: &Config) -> Self {
+        let (channels, has_sums) = found.map_or_else(Default::default, |(instrument, has_sums, _)| {
+            (instrument.frequencies_hz(), has_sums)
+        });
         let mapped: Vec<(ChannelId, f64)> =
             (0..).map(ChannelId).zip(channels).filter(|(number, _)| config.map.is_mapped(*number)).collect();
         let has = |number: &ChannelId| has_sums.get(usize::from(number.0)).copied().unwrap_or(false);

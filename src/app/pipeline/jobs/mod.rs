@@ -28,7 +28,7 @@ pub use design_file::{Design, DesignObjective};
 pub use design_limits::breathing_m_s_per_year;
 pub use event::{JobEvent, JobWatcher, MapStep};
 pub use groups::{channel_groups, replay_in_groups, run_in_groups};
-pub use joint::{joint_channels, solve_states_jointly};
+pub use joint::{has_powers, joint_channels, solve_states_jointly};
 pub use mission::Mission;
 pub use realisations::{PowerSpread, RealisationSpread};
 pub use sensitivity::{ArraySensitivity, SENSITIVITY_L_MAX};

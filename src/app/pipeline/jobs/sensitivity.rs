@@ -128,7 +128,8 @@ fn thinned(schedule: Schedule, windows: usize, excess: f64) -> (Schedule, Vec<us
 /// The schedule of a channel without baselines that are not mapped, or of 2 pi b / lambda above l + 10.
 ///
 /// Those see every degree, too, as j_l(x)^2 is 1 / (2 x^2) on average, but weakly: without them noise is estimated too high, the more the fewer
-/// baselines are short.
+/// baselines are short. Of eight satellites at 10 MHz, 2.5 measured modes of l = 12 are estimated, where a map of nside 16 has 9.6; all its
+/// baselines and degrees up to 40 would give 10.6, in many times the time. At 3 MHz: 23.8, and 24.0 of the map.
 fn short_baselines(plan: &Plan, channel: usize) -> Schedule {
     let schedule = plan.schedules[channel];
     let reach = (SENSITIVITY_L_MAX + L_MARGIN + 10) as f64 / std::f64::consts::TAU;

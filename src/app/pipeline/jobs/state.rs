@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::ground::archive::REMEMBERED;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
 use crate::imaging::{REFINED, Regulariser, RegulariserChoice};
-use crate::imaging::{Samples, Solution, SolveWatch, Solver, SolverSetup};
+use crate::imaging::{Samples, Solution, SolveError, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
 use crate::units::PerChannel;
@@ -170,7 +170,7 @@ pub fn solve_state(
 /// Maps every channel of a state, with `samples` from the posterior; R is estimated from the data. The state is unchanged.
 ///
 /// # Errors
-/// As [`solve_state`].
+/// As [`solve_state`]; [`crate::imaging::SolveError::Interrupted`] after the channels that were finished when `watch` was cancelled.
 pub fn sample_state(
     folder: &Path,
     config: &Config,
@@ -190,10 +190,16 @@ fn solve_sums(
     found: &mut dyn FnMut(Solution),
 ) -> Result<(), PipelineError> {
     let sums = Ground::sums_in(folder, &config.ground(WAIT_BYTES))?;
+    let watch = setup.watch.clone();
     let mut solver = Solver::new(setup);
     for snapshot in sums {
         let mut out = Outlet::collect();
-        solver.step(snapshot, &mut out)?;
+        let solved = solver.step(snapshot, &mut out);
+        // A solution that was cut short may also fail.
+        if watch.is_cancelled() {
+            return Err(SolveError::Interrupted.into());
+        }
+        solved?;
         out.into_vec().into_iter().for_each(&mut *found);
     }
     Ok(())

@@ -280,6 +280,8 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
     for case in &done {
         let mut figures = RunFigures::read(&out.join(case.folder()))?;
         figures.label = case.label();
+        let engine = if case.plan.config.map.is_harmonic() { "harmonic" } else { "pixel" };
+        figures.engine = Some(engine.to_owned());
         let mut config = case.plan.config.clone();
         config.map.epsilon = None;
         let key = serde_json::to_vec(&(config, case.calibrated)).unwrap_or_default();

@@ -20,7 +20,7 @@ const IDENTIFICATION: u16 = 1 << 11;
 const COUNT_BITS: u32 = 14;
 
 /// Largest packet count: 46 bits.
-pub(crate) const COUNT_MAX: u64 = (1 << 46) - 1;
+pub const COUNT_MAX: u64 = (1 << 46) - 1;
 
 /// Segmentation flags: which part of a payload a packet carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]

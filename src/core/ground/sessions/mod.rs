@@ -134,16 +134,18 @@ impl Ground {
         }
     }
 
-    /// The instrument of an archive, and whether each channel has sums, from its newest usable checkpoint; `None` if that has received no
-    /// description of it.
+    /// The instrument of an archive, whether each channel has sums, and whether there are total powers, from its newest usable checkpoint;
+    /// `None` if that has received no description of it.
     ///
     /// # Errors
     /// A folder without a usable checkpoint, or in use.
     #[doc(hidden)]
-    pub fn channels_in(folder: &Path) -> Result<Option<(Instrument, Vec<bool>)>, GroundError> {
+    pub fn channels_in(folder: &Path) -> Result<Option<(Instrument, Vec<bool>, bool)>, GroundError> {
         let of_head = |path: &Path| {
             head_at(path, |head| {
-                Some((head.collector.instrument()?.clone(), head.accumulator.has_sums().to_vec()))
+                let instrument = head.collector.instrument()?.clone();
+                let has_powers = !head.autos.list(&instrument).is_empty();
+                Some((instrument, head.accumulator.has_sums().to_vec(), has_powers))
             })
         };
         let (found, _) = StateFolder::open_to_read(folder)?.load(false, of_head)?;

@@ -90,6 +90,8 @@ pub struct JointSolution {
     pub spectra: Option<SpectralMaps>,
     /// Convergence of the iteration.
     pub convergence: Convergence,
+    /// Number of posterior samples, from which errors of means and spectra are.
+    pub samples: usize,
 }
 
 /// The solution of a single channel.
@@ -166,7 +168,8 @@ pub fn solve_jointly(
         if channels.len() > 1 { Some(posterior.spectra(&views[..prior.channels()], nside)?) } else { None };
     maps.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
     maps.dedup_by(|a, b| a.frequency_hz == b.frequency_hz);
-    Ok(JointSolution { likeness, maps, spectra, convergence: posterior.convergence })
+    let (samples, convergence) = (request.samples, posterior.convergence);
+    Ok(JointSolution { likeness, maps, spectra, convergence, samples })
 }
 
 /// The rows of total powers of each channel; `None` if it has none.

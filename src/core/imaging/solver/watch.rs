@@ -117,6 +117,12 @@ impl SolveWatch {
         Self { grace: Some(grace), ..self }
     }
 
+    /// Whether `cancel` was triggered.
+    #[must_use]
+    pub fn is_cancelled(&self) -> bool {
+        self.cancel.is_cancelled()
+    }
+
     /// Whether the time limit after cancellation has passed.
     fn is_expired(&self) -> bool {
         self.cancel.elapsed().zip(self.grace).is_some_and(|(elapsed, grace)| elapsed >= grace)

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
+use std::fmt;
 
 use num_complex::Complex64;
 use serde::Serialize;
@@ -73,6 +74,19 @@ impl AveragingCounts {
     pub fn total(&self) -> u64 {
         let Self { averaged, hidden, limb, short, long, insensitive, unusable } = self;
         averaged + hidden + limb + short + long + insensitive + unusable
+    }
+}
+
+impl fmt::Display for AveragingCounts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { averaged, hidden, limb, short, long, insensitive, unusable } = self;
+        write!(
+            f,
+            "Of {} visibilities {averaged} are in an average; of {hidden} the Moon hides the patch, of {limb} its limb crosses it, of {short} \
+             the baseline is too short, of {long} too long, of {insensitive} the antennas hardly respond to the patch, and {unusable} have \
+             no usable value, weight or position",
+            self.total()
+        )
     }
 }
 
@@ -269,6 +283,28 @@ mod tests {
             placed.duration_s.push(0.1);
         }
         placed
+    }
+
+    #[test]
+    fn counts_are_told_in_words() {
+        let counts = AveragingCounts {
+            averaged: 1,
+            hidden: 20,
+            limb: 3,
+            short: 400,
+            long: 5,
+            insensitive: 6,
+            unusable: 7,
+        };
+        let said = super::super::ZoomError::NoRows(counts).to_string();
+        for part in [
+            "Of 442 visibilities 1 are in an average",
+            "of 20 the Moon hides",
+            "of 400 the baseline is too short",
+            "7 have",
+        ] {
+            assert!(said.contains(part), "{part}: {said}");
+        }
     }
 
     fn setup(patch: Patch, known: Vec<KnownSource>) -> AveragingSetup {

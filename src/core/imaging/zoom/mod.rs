@@ -50,7 +50,7 @@ pub enum ZoomError {
     /// No visibility is left.
     #[error(
         "no visibility sees the whole patch between the shortest and the longest baseline; expected data from the patch's side of the \
-         Moon, and limits that leave some: {0:?}"
+         Moon, and limits that leave some. {0}"
     )]
     NoRows(AveragingCounts),
     /// The pixels are too large for the baselines.
