@@ -36,11 +36,11 @@ class JointMap:
 class Joint:
     """Maps at all frequencies in increasing order, and the spectrum of every pixel at the resolution of the coarsest channel:
     ``T = T_0 (nu / reference_hz)^(index + curvature / 2 ln(nu / reference_hz))``, not a number where a map is negative; empty for one
-    channel alone (``curvature`` for two). ``likeness`` is the correlation between channels, ``converged`` whether the iteration
+    channel alone (``curvature`` for two). ``likeness`` is the correlation between channels by degree, ``converged`` whether the iteration
     reached ``map.residual_max``."""
 
     maps: list[JointMap]
-    likeness: dict[str, float] | None
+    likeness: list[dict[str, float]]
     converged: bool
     iterations: int
     residual: float

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 
 use super::plan::Plan;
 use super::sections::Config;
-use crate::array::ObservingWindows;
+use crate::array::{NodeMotion, ObservingWindows};
 use crate::calibration::{CORRELATED_MAX, CalibrationHook, GainsFile, VanVleck};
-use crate::imaging::Method;
+use crate::imaging::{Method, RegulariserChoice};
 use crate::mother::{Fidelity, largest_gap};
 use crate::units::Dimension;
 use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
@@ -19,6 +19,13 @@ const CORRECTED_DEG: f64 = 2.0;
 /// 0.3 had rho_2 = 0.74 and a mean 12 % too low; one from 122 windows with gaps of 0.1 had rho_2 = 1.00 and a mean within 0.1 %.
 const GAP_MAX: f64 = 0.15;
 
+/// J2 of the Moon and the radius to which it refers (GRAIL).
+const MOON_J2: f64 = 2.033e-4;
+const MOON_J2_RADIUS_M: f64 = 1.738e6;
+
+/// Accepted difference of the node's rate from that by J2, in units of the rate of an equatorial orbit; the paper's is 0.04.
+const PRECESSION_TOLERANCE: f64 = 0.1;
+
 /// Accepted relative difference of the orbital period from Kepler's third law; the paper's is 2e-4.
 const PERIOD_TOLERANCE: f64 = 0.01;
 
@@ -29,6 +36,8 @@ impl Config {
     pub fn notes(&self) -> Vec<String> {
         let notes = [
             self.period_note(),
+            self.precession_note(),
+            self.coverage_note(),
             self.quantiser_note(),
             self.positions_note(),
             self.reach_note(),
@@ -114,10 +123,54 @@ impl Config {
         let is_formation = !array.has_own_orbits();
         (differs && is_formation && array.moon_radius_m == MOON_RADIUS_M).then(|| {
             format!(
-                "array.orbital_period_s = {}, but an orbit {} above the Moon takes {kepler_s:.2} s; \
-                 array.precession_period_s does not follow the altitude, either",
+                "array.orbital_period_s = {}, but an orbit {} above the Moon takes {kepler_s:.2} s",
                 array.orbital_period_s,
                 Dimension::Length.show(array.altitude_m)
+            )
+        })
+    }
+
+    /// A note if the node does not turn as the Moon's flattening turns it.
+    fn precession_note(&self) -> Option<String> {
+        let array = &self.array;
+        if array.has_own_orbits() || array.moon_radius_m != MOON_RADIUS_M {
+            return None;
+        }
+        let (radius_m, inclination_rad) =
+            (array.moon_radius_m + array.altitude_m, array.inclination_deg.to_radians());
+        let motion = (MOON_GM_M3_S2 / radius_m.powi(3)).sqrt();
+        let rate = -1.5 * motion * MOON_J2 * (MOON_J2_RADIUS_M / radius_m).powi(2) * inclination_rad.cos();
+        let sign = if array.node_motion == NodeMotion::Regress { -1.0 } else { 1.0 };
+        let given = sign * TAU / array.precession_period_s;
+        // At 90 degrees the node stands still, within the tolerance of the default orbit.
+        let fastest = 1.5 * motion * MOON_J2 * (MOON_J2_RADIUS_M / radius_m).powi(2);
+        ((given - rate).abs() > PRECESSION_TOLERANCE * fastest).then(|| {
+            let turns = match TAU / rate.abs() {
+                period_s if rate.abs() < 1e-3 * fastest || !period_s.is_finite() => "hardly turns the node".to_owned(),
+                period_s => format!(
+                    "turns the node once in {period_s:.3e} s, array.node_motion = {}",
+                    if rate < 0.0 { "\"regress\"" } else { "\"advance\"" }
+                ),
+            };
+            format!(
+                "array.precession_period_s = {:e}, but the Moon's flattening (J2) {turns} at an inclination of {} deg and an altitude of {}",
+                array.precession_period_s,
+                array.inclination_deg,
+                Dimension::Length.show(array.altitude_m)
+            )
+        })
+    }
+
+    /// A note if the mission is too short for the errors of harmonic maps.
+    fn coverage_note(&self) -> Option<String> {
+        let is_harmonic =
+            self.map.method() == Method::Harmonic && self.map.regulariser == RegulariserChoice::Data;
+        (is_harmonic && self.has_short_coverage()).then(|| {
+            format!(
+                "in spacecraft.duration_s = {} the node turns by {:.1} of 360 deg: errors, mask and C_l of harmonic maps with R from the data are \
+                 wrong then (errors 6 times too small after a week); map.engine = \"pixel\" states better ones",
+                self.spacecraft.duration_s,
+                360.0 * self.spacecraft.duration_s / self.array.precession_period_s,
             )
         })
     }
@@ -187,12 +240,47 @@ mod tests {
             config.notes()
         );
         config.array.orbital_period_s = 6779.0;
+        // 2 pi / (1.5 n J2 (1738 km / 1787.1 km)^2 cos 30 deg), n = 2 pi / 6779 s.
+        assert!(config.notes()[0].contains("once in 2.71"), "{:?}", config.notes());
+        config.array.precession_period_s = 2.7e7;
+        assert_eq!(config.notes(), Vec::<String>::new());
+        config.array.inclination_deg = 90.0;
+        assert!(config.notes()[0].contains("hardly turns the node"), "{:?}", config.notes());
+        config.array.inclination_deg = 150.0;
+        assert!(config.notes()[0].contains("array.node_motion = \"advance\""), "{:?}", config.notes());
+        config.array.node_motion = NodeMotion::Advance;
         assert_eq!(config.notes(), Vec::<String>::new());
         config.spacecraft.fidelity = Fidelity::Samples;
         config.daughters.bits = 1;
         assert!(config.notes()[0].contains("calibration.quantiser_bits = 1"), "{:?}", config.notes());
         config.calibration.quantiser_bits = 1;
         assert_eq!(config.notes(), Vec::<String>::new());
+    }
+
+    #[test]
+    fn short_missions_are_mapped_in_pixels_or_named() {
+        let engine = |set: &dyn Fn(&mut Config)| {
+            let mut config = Config::default();
+            config.spacecraft.duration_s = 7.0 * DAY_S;
+            set(&mut config);
+            config.choose_engine(true);
+            (config.map.engine, config.notes())
+        };
+        assert_eq!(engine(&|_| ()), (EngineKind::Pixel, Vec::new()));
+        // 7 of 474.8 days.
+        for (engine, notes) in [
+            engine(&|config| config.map.nside = 32),
+            engine(&|config| config.map.engine = EngineKind::Harmonic),
+        ] {
+            assert_eq!(engine, EngineKind::Harmonic);
+            assert!(notes.len() == 1 && notes[0].contains("the node turns by 5.3 of 360 deg"), "{notes:?}");
+        }
+        // More than a twelfth of a turn, and a key that pixels do not have.
+        assert_eq!(
+            engine(&|config| config.spacecraft.duration_s = 40.0 * DAY_S),
+            (EngineKind::Harmonic, Vec::new())
+        );
+        assert_eq!(engine(&|config| config.map.l_max = 30).0, EngineKind::Harmonic);
     }
 
     #[test]
