@@ -5,12 +5,12 @@
 //! more than half. A power has to rise above what follows, too, as the Moon's limb makes steps; so an alert by powers needs three bins after
 //! the burst, one by visibilities nothing but them.
 //!
-//! **False alarms.** Each look at an open pass tries its bins again, with quartiles and scatters of what has come so far. Of m visibilities
-//! of a pair, one exceeds 8 times the quartile of the others, the k-th from below, with probability `product of l / (l + 8)` over the k largest
-//! l < m: 1.6e-4 for the least, 24, where 4 of 7 pairs do with 2.5e-14. All looks of a pass, up to 286 at 64ths, have 8e-12 together, 1e-6 in a
-//! mission of 30 channels and 5000 passes, as far as visibilities are Gaussian and independent. By powers a rise has to be 8 times their scatter, which few bins do
-//! not tell: of 3e6 simulated looks at 48 bins of noise, 8 had a false alarm, of 1e6 at 64 bins none. With noise below 0.6 %, as of 8 kHz in
-//! integrations of 4 s, the least rise of 5 % is the larger, and the noise has none.
+//! **False alarms.** Each look at an open pass tries its bins again, with quartiles and scatters of what has come so far. Of m visibilities of a
+//! pair, one exceeds 8 times the quartile of the others, the k-th from below, with probability `product of l / (l + 8)` over the k largest l < m:
+//! 1.6e-4 for the least, 24, where 4 of 7 pairs do with 2.5e-14. All looks of a pass, up to 286 at 64ths, have 8e-12 together, 1e-6 in a mission
+//! of 30 channels and 5000 passes, as far as visibilities are Gaussian and independent. By powers a rise has to be 8 times their scatter, which
+//! few bins do not tell: of 3e6 simulated looks at 48 bins of noise, 8 had a false alarm, of 1e6 at 64 bins none. With noise below 0.6 %, as of 8
+//! kHz in integrations of 4 s, the least rise of 5 % is the larger, and the noise has none.
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -7,17 +7,14 @@
 //! Simulations that do not smear integrations have the phase of the middle.
 
 use std::collections::BTreeMap;
-use std::f64::consts::{PI, TAU};
 
 use num_complex::Complex64;
 
-use super::peel::BurstRow;
+use super::rows::{BurstRow, Place, Share, baseline, motion, phasor, shares};
 use crate::array::hidden_by_moon;
-use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::DenseFactor;
-use crate::response::pixel::PairGeometry;
 use crate::units::Pair;
-use crate::units::vector::{Vec3, add, dot, scale, sub};
+use crate::units::vector::{Vec3, add, dot, scale};
 
 /// Cells of a burst.
 const CELLS: usize = 128;
@@ -33,18 +30,6 @@ const SHARE_MAX: f64 = 0.7;
 
 /// Work of a visibility in units of that of a product of two cells.
 const WORK_OF_ROW: f64 = 1e3;
-
-/// Longest time between visibilities whose difference is the motion of a baseline, s.
-const MOTION_S_MAX: f64 = 150.0;
-
-/// A source that may have a flux.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Place {
-    pub(super) hat: Vec3,
-    pub(super) moon_radius_m: f64,
-    /// Whether fringes turn during integrations.
-    pub(super) smears: bool,
-}
 
 /// The source in a visibility: `exp(2 pi i turns) V` is the sum of the powers of cells times their factors.
 struct Term {
@@ -69,64 +54,6 @@ pub(super) struct Flux {
     cell_s: f64,
     power_k_sr: Vec<f64>,
     factor: DenseFactor,
-}
-
-/// Baseline of a visibility, wavelengths.
-pub(super) fn baseline(block: &PlacedVisibilities, k: usize) -> Vec3 {
-    geometry(block, k).baseline_wavelengths()
-}
-
-pub(super) fn geometry(block: &PlacedVisibilities, k: usize) -> PairGeometry {
-    PairGeometry {
-        r_i_m: block.r_i_m[k],
-        r_j_m: block.r_j_m[k],
-        frequency_hz: block.frequency_hz,
-        moon_radius_m: 0.0,
-        response: AntennaResponse::Isotropic,
-    }
-}
-
-/// The part of an integration that lies in a cell.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Share {
-    pub(super) cell: usize,
-    pub(super) share: f64,
-    /// Its middle after that of the integration, s.
-    after_s: f64,
-}
-
-impl Share {
-    /// The share with the mean over its part of a fringe that turns at a rate, 1/s, in units of the fringe at the middle of the integration.
-    pub(super) fn turned(&self, rate: f64, duration_s: f64) -> Complex64 {
-        self.share * sinc(PI * rate * self.share * duration_s) * phasor(-rate * self.after_s)
-    }
-}
-
-/// The parts of an integration, by its middle and length, in cells, by the start of the first and their length, s.
-pub(super) fn shares(
-    [from_s, cell_s]: [f64; 2],
-    cells: usize,
-    [middle_s, duration_s]: [f64; 2],
-) -> impl Iterator<Item = Share> + use<> {
-    let (duration, middle) = (duration_s / cell_s, (middle_s - from_s) / cell_s);
-    let (from, until) = (middle - 0.5 * duration, middle + 0.5 * duration);
-    let within = from.max(0.0) as usize..(until.max(0.0).ceil() as usize).min(cells);
-    let part = move |cell: usize| {
-        let [start, end] = [from.max(cell as f64), until.min((cell + 1) as f64)];
-        Share { cell, share: (end - start) / duration, after_s: cell_s * (0.5 * (start + end) - middle) }
-    };
-    within.map(part).filter(|part| part.share > 0.0)
-}
-
-/// Motion of the baseline of a visibility, wavelengths per s, by those beside it in its block; zero without one.
-pub(super) fn motion(block: &PlacedVisibilities, k: usize) -> Vec3 {
-    let (before, after) = (k.saturating_sub(1), (k + 1).min(block.len() - 1));
-    let s = block.time_s[after] - block.time_s[before];
-    if s > 0.0 && s < MOTION_S_MAX * (after - before) as f64 {
-        scale(s.recip(), sub(baseline(block, after), baseline(block, before)))
-    } else {
-        [0.0; 3]
-    }
 }
 
 /// Length of a cell, s.
@@ -279,14 +206,4 @@ impl Term {
     fn value(&self, row: &BurstRow) -> Complex64 {
         row.block.value_k_sr[row.k] * phasor(self.turns)
     }
-}
-
-/// `sin(x) / x`.
-pub(super) fn sinc(x: f64) -> f64 {
-    if x.abs() < 1e-6 { 1.0 } else { x.sin() / x }
-}
-
-/// `exp(2 pi i turns)`.
-pub(super) fn phasor(turns: f64) -> Complex64 {
-    Complex64::cis(TAU * (turns - turns.round()))
 }

@@ -9,6 +9,7 @@ mod flux;
 mod locate;
 mod peel;
 mod refine;
+mod rows;
 
 pub use detect::find_bursts;
 pub use early::{BurstAlert, PassAlerts, find_alerts};

@@ -1,12 +1,13 @@
 //! The flux of a burst by time, fitted and subtracted.
 //!
-//! A visibility of the burst is the mean over its integration of the power by time, times the fringe of the direction, or 0 where the Moon hides it
-//! from a daughter. The fringe turns by up to an eighth in an integration, which takes 2.6 % of a steady power; if the visibilities say that
-//! theirs did, each cell has its mean over the part of the integration in it, or else (simulations that do not smear) that at the middle. The powers of cells of equal length are fitted to all pairs by weighted least squares; what the steady
-//! sky adds is noise of the fit, as the pair has it in the pass. Long baselines see little of it and integrate for a short time, and so say
-//! how bright the burst was when; short ones, which a map needs, are rid of it. The variance of the power is added to theirs: it bounds
-//! that of one part. Errors of the parts of a pair, and of pairs, have signs in common, which is neglected. Projecting the column out of the sums
-//! instead would mix pairs, so that they no longer were sums over visibilities.
+//! A visibility of the burst is the mean over its integration of the power by time, times the fringe of the direction, or 0 where the Moon hides
+//! it from a daughter. The fringe turns by up to an eighth in an integration, which takes 2.6 % of a steady power; if the visibilities say that
+//! theirs did, each cell has its mean over the part of the integration in it, or else (simulations that do not smear) that at the middle. The
+//! powers of cells of equal length are fitted to all pairs by weighted least squares; what the steady sky adds is noise of the fit, as the pair
+//! has it in the pass. Long baselines see little of it and integrate for a short time, and so say how bright the burst was when; short ones, which
+//! a map needs, are rid of it. The variance of the power is added to theirs: it bounds that of one part. Errors of the parts of a pair, and of
+//! pairs, have signs in common, which is neglected. Projecting the column out of the sums instead would mix pairs, so that they no longer were
+//! sums over visibilities.
 //!
 //! Where the residuals are above what noise and steady sky have, the source is not a point or is elsewhere: such cells are left out.
 //! Residuals of visibilities from which the Moon hides the direction are judged by themselves. What the fit has not seen is left out too.
@@ -16,7 +17,7 @@ use std::cmp::Ordering;
 use bincode::{Decode, Encode};
 use num_complex::Complex64;
 
-use super::flux::{Place, Share, motion, shares};
+use super::rows::{BurstRow, Place, Share, duration_s, motion, shares};
 use crate::array::hidden_by_moon;
 use crate::frames::PlacedVisibilities;
 use crate::numerics::{DenseFactor, median};
@@ -81,30 +82,6 @@ pub struct LightCurve {
     pub variance_k2_sr2: Vec<f32>,
     /// What it was fitted to, by pair, band and start.
     pub(super) fitted: Vec<FittedSpan>,
-}
-
-/// A visibility of a burst, for the fit.
-#[derive(Clone, Copy)]
-pub(super) struct BurstRow<'a> {
-    pub(super) block: &'a PlacedVisibilities,
-    pub(super) k: usize,
-    /// Mean squared modulus of what the steady sky adds, (K sr)^2.
-    pub(super) steady_k2_sr2: f64,
-}
-
-impl BurstRow<'_> {
-    pub(super) fn duration_s(&self) -> f64 {
-        duration_s(self.block, self.k)
-    }
-
-    /// Variance, real and imaginary part together, with the steady sky counted a number of times.
-    pub(super) fn variance_k2_sr2(&self, times: f64) -> f64 {
-        times * self.steady_k2_sr2 + 2.0 / self.block.weight[self.k]
-    }
-}
-
-fn duration_s(block: &PlacedVisibilities, k: usize) -> f64 {
-    block.duration_s.get(k).copied().map_or(0.0, f64::from).max(1e-3)
 }
 
 /// The spans of rows, which follow each other by block.

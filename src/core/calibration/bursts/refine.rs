@@ -17,9 +17,9 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::BurstSearch;
-use super::flux::{Flux, Place, Seen, affordable, baseline, phasor, sinc};
+use super::flux::{Flux, Seen, affordable};
 use super::locate::Candidate;
-use super::peel::BurstRow;
+use super::rows::{BurstRow, Place, baseline, phasor, sinc};
 use crate::array::{jupiter_hat_by_date, sun_hat_by_date};
 use crate::units::Pair;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};

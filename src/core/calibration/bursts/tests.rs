@@ -8,8 +8,8 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::flux::{Flux, Place};
-use super::peel::BurstRow;
+use super::flux::Flux;
+use super::rows::{BurstRow, Place};
 use super::*;
 use crate::array::{Array, hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
 use crate::response::beacon::plane_wave;
