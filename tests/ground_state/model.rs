@@ -159,7 +159,7 @@ impl Sequence<'_> {
         match (self.below(3), oldest) {
             (1, Some((path, bytes))) => std::fs::write(path, bytes).unwrap(),
             (2, _) => {
-                std::fs::write(folder.join("checkpoint-00000099.lunarray.partial"), b"LNRSTA12").unwrap()
+                std::fs::write(folder.join("checkpoint-00000099.lunarray.partial"), b"LNRSTA13").unwrap()
             }
             _ => {}
         }

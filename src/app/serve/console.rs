@@ -267,6 +267,9 @@ impl Console {
             burst_alerts: ground
                 .filter(|ground| ground.bursts.choice() != BurstChoice::Off)
                 .map(|ground| ground.bursts.alerts() as u64),
+            burst_alerts_untold: ground
+                .filter(|ground| ground.bursts.choice() != BurstChoice::Off)
+                .map(|ground| ground.bursts.untold_alerts()),
             waiting_bytes: ground.map(|ground| ground.waiting_bytes.load(Ordering::Relaxed)),
             listening,
             saving: view.and_then(RunView::saving),

@@ -208,6 +208,11 @@ impl Scrape {
             let about = "Alerts of bursts before their passes ended, in this session";
             counter(out, MetricInfo("burst_alerts", about, None), alerts)?;
         }
+        if let Some(untold) = self.status.burst_alerts_untold {
+            let about =
+                "Alerts of bursts that were only counted, as their passes had eight in their channels";
+            counter(out, MetricInfo("burst_alerts_untold", about, None), untold)?;
+        }
         self.saving(out)?;
         let Some(products) = &self.status.products else { return Ok(()) };
         let about = "Attempts to write maps and pictures that failed";

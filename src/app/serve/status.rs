@@ -192,6 +192,9 @@ pub(super) struct Status {
     /// Number of alerts of bursts before their passes ended, in this session.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) burst_alerts: Option<u64>,
+    /// Number of further ones, counted only, as their passes had had eight in their channels.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) burst_alerts_untold: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) listening: Option<ListenerStatus>,
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -30,7 +30,7 @@ pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 #[doc(hidden)]
 pub use bursts::{
     BurstAlert, BurstChoice, BurstSearch, BurstSummary, DividedBlock, FoundBurst, FoundBursts, LightCurve,
-    find_alerts, find_bursts,
+    PassAlerts, find_alerts, find_bursts,
 };
 #[doc(hidden)]
 pub use config::{CalibrationConfig, CalibrationHook};

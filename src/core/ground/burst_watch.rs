@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::mem;
 
 use super::DeliveredPacket;
-use crate::calibration::{BurstSearch, FoundBurst, FoundBursts, find_alerts, find_bursts};
+use crate::calibration::{BurstSearch, FoundBurst, FoundBursts, PassAlerts, find_alerts, find_bursts};
 use crate::downlink::receive::SendingKey;
 use crate::frames::{PlacedFrame, PlacedVisibilities};
 use crate::units::ChannelId;
@@ -24,7 +24,7 @@ const VISIBILITIES_MAX: usize = 1 << 18;
 /// take as long as some nine of all of it.
 const GROWTH: f64 = 1.0 / 8.0;
 
-/// The same while nothing else waits.
+/// The same while nothing else waits: some 65 times.
 const IDLE_GROWTH: f64 = 1.0 / 64.0;
 
 /// A block of visibilities, and the packet that brought it.
@@ -42,6 +42,7 @@ struct WatchedChannel {
     visibilities: usize,
     /// How many of them there were at the last search.
     searched: usize,
+    alerts: PassAlerts,
 }
 
 /// The visibilities of the open pass, by channel.
@@ -88,7 +89,7 @@ impl BurstWatch {
             if new as f64 > growth * channel.searched as f64 {
                 channel.searched = channel.visibilities;
                 let placed: Vec<_> = channel.blocks.iter().map(|block| &block.placed).collect();
-                find_alerts(&placed).into_iter().for_each(|alert| bursts.alert(alert));
+                bursts.alert(&mut channel.alerts, find_alerts(&placed));
             }
         }
     }

@@ -7,17 +7,14 @@
 //! Simulations that do not smear integrations have the phase of the middle.
 
 use std::collections::BTreeMap;
-use std::f64::consts::{PI, TAU};
 
 use num_complex::Complex64;
 
-use super::peel::BurstRow;
+use super::rows::{BurstRow, Place, Share, baseline, motion, phasor, shares};
 use crate::array::hidden_by_moon;
-use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::DenseFactor;
-use crate::response::pixel::PairGeometry;
 use crate::units::Pair;
-use crate::units::vector::{Vec3, add, dot, scale, sub};
+use crate::units::vector::{Vec3, add, dot, scale};
 
 /// Cells of a burst.
 const CELLS: usize = 128;
@@ -31,17 +28,8 @@ const WALK_S: f64 = 5.0;
 /// Largest share of a pair in a flux whose error is found by pairs.
 const SHARE_MAX: f64 = 0.7;
 
-/// Longest time between visibilities whose difference is the motion of a baseline, s.
-const MOTION_S_MAX: f64 = 150.0;
-
-/// A source that may have a flux.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Place {
-    pub(super) hat: Vec3,
-    pub(super) moon_radius_m: f64,
-    /// Whether fringes turn during integrations.
-    pub(super) smears: bool,
-}
+/// Work of a visibility in units of that of a product of two cells.
+const WORK_OF_ROW: f64 = 1e3;
 
 /// The source in a visibility: `exp(2 pi i turns) V` is the sum of the powers of cells times their factors.
 struct Term {
@@ -68,36 +56,23 @@ pub(super) struct Flux {
     factor: DenseFactor,
 }
 
-/// Baseline of a visibility, wavelengths.
-pub(super) fn baseline(block: &PlacedVisibilities, k: usize) -> Vec3 {
-    geometry(block, k).baseline_wavelengths()
+/// Length of a cell, s.
+fn cell_s([from_s, until_s]: [f64; 2]) -> f64 {
+    ((until_s - from_s) / CELLS as f64).max(CELL_S_MIN)
 }
 
-pub(super) fn geometry(block: &PlacedVisibilities, k: usize) -> PairGeometry {
-    PairGeometry {
-        r_i_m: block.r_i_m[k],
-        r_j_m: block.r_j_m[k],
-        frequency_hz: block.frequency_hz,
-        moon_radius_m: 0.0,
-        response: AntennaResponse::Isotropic,
-    }
-}
-
-/// Motion of the baseline of a visibility, wavelengths per s, by those beside it in its block; zero without one.
-fn motion(block: &PlacedVisibilities, k: usize) -> Vec3 {
-    let (before, after) = (k.saturating_sub(1), (k + 1).min(block.len() - 1));
-    let s = block.time_s[after] - block.time_s[before];
-    if s > 0.0 && s < MOTION_S_MAX * (after - before) as f64 {
-        scale(s.recip(), sub(baseline(block, after), baseline(block, before)))
-    } else {
-        [0.0; 3]
-    }
+/// All visibilities, or as many of them, evenly, as a fit may take: a thousand times more than those of short integrations need are refused. Lengths
+/// of integrations are untrusted.
+pub(super) fn affordable<'a>(rows: &[BurstRow<'a>], span_s: [f64; 2], work_max: f64) -> Vec<BurstRow<'a>> {
+    let work = |row: &BurstRow| (row.duration_s() / cell_s(span_s) + 2.0).min(CELLS as f64).powi(2);
+    let work: f64 = rows.iter().map(|row| WORK_OF_ROW + work(row)).sum();
+    rows.iter().step_by((work / work_max).ceil().max(1.0) as usize).copied().collect()
 }
 
 impl Flux {
     /// Fits the powers; `None` if the visibilities do not determine them.
     pub(super) fn fit(rows: &[BurstRow], place: Place, [from_s, until_s]: [f64; 2]) -> Option<Self> {
-        let cell_s = ((until_s - from_s) / CELLS as f64).max(CELL_S_MIN);
+        let cell_s = cell_s([from_s, until_s]);
         let cells = (((until_s - from_s) / cell_s).ceil() as usize).clamp(1, CELLS);
         let power_k_sr = vec![0.0; cells];
         let mut flux = Self { place, from_s, cell_s, power_k_sr, factor: DenseFactor::new(&[1.0], 1)? };
@@ -113,6 +88,9 @@ impl Flux {
                     matrix[cell * cells + other] += information * factor.re * of_other.re;
                 }
             }
+        }
+        if largest_k_sr <= 0.0 {
+            return None;
         }
         // Information counts both parts of a visibility: half the inverse variance.
         let tie = 0.5 * WALK_S / (cell_s * largest_k_sr * largest_k_sr);
@@ -137,18 +115,8 @@ impl Flux {
         self.power_k_sr.iter().copied().fold(0.0, f64::max)
     }
 
-    /// Cells of an integration, the parts of it that lie in them, and their middles after that of the integration, s.
-    fn shares(&self, row: &BurstRow) -> impl Iterator<Item = (usize, f64, f64)> + use<> {
-        let (cell_s, cells) = (self.cell_s, self.power_k_sr.len());
-        let duration = row.duration_s() / cell_s;
-        let middle = (row.block.time_s[row.k] - self.from_s) / cell_s;
-        let (from, until) = (middle - 0.5 * duration, middle + 0.5 * duration);
-        let within = from.max(0.0) as usize..(until.max(0.0).ceil() as usize).min(cells);
-        let part = move |cell: usize| {
-            let [start, end] = [from.max(cell as f64), until.min((cell + 1) as f64)];
-            (cell, (end - start) / duration, cell_s * (0.5 * (start + end) - middle))
-        };
-        within.map(part).filter(|(_, share, _)| *share > 0.0)
+    fn shares(&self, row: &BurstRow) -> impl Iterator<Item = Share> + use<> {
+        shares([self.from_s, self.cell_s], self.power_k_sr.len(), [row.block.time_s[row.k], row.duration_s()])
     }
 
     /// The source in a visibility; `None` where the Moon hides it.
@@ -159,12 +127,9 @@ impl Flux {
             return None;
         }
         let rate = if smears { dot(motion(block, k), hat) } else { 0.0 };
-        // A cell averages the fringe over its part of the integration.
         let duration_s = row.duration_s();
-        let factor = |(cell, share, after_s): (usize, f64, f64)| {
-            (cell, share * sinc(PI * rate * share * duration_s) * phasor(-rate * after_s))
-        };
-        Some(Term { turns: dot(baseline(block, k), hat), cells: self.shares(row).map(factor).collect() })
+        let cells = self.shares(row).map(|share| (share.cell, share.turned(rate, duration_s))).collect();
+        Some(Term { turns: dot(baseline(block, k), hat), cells })
     }
 
     /// What a visibility has of the source; `None` where the Moon hides it.
@@ -172,7 +137,7 @@ impl Flux {
         let term = self.term(row)?;
         let sum = self.sum(&term);
         let mut weighted = [0.0; 2];
-        for (cell, share, after_s) in self.shares(row) {
+        for Share { cell, share, after_s } in self.shares(row) {
             let power = share * self.power_k_sr[cell].max(0.0);
             weighted = [weighted[0] + power, weighted[1] + power * after_s];
         }
@@ -192,7 +157,7 @@ impl Flux {
 
     /// Mean power in an integration, K sr, also where the Moon hides the source.
     pub(super) fn power_k_sr_in(&self, row: &BurstRow) -> f64 {
-        self.shares(row).map(|(cell, share, _)| share * self.power_k_sr[cell]).sum()
+        self.shares(row).map(|Share { cell, share, .. }| share * self.power_k_sr[cell]).sum()
     }
 
     fn sum(&self, term: &Term) -> Complex64 {
@@ -241,14 +206,4 @@ impl Term {
     fn value(&self, row: &BurstRow) -> Complex64 {
         row.block.value_k_sr[row.k] * phasor(self.turns)
     }
-}
-
-/// `sin(x) / x`.
-pub(super) fn sinc(x: f64) -> f64 {
-    if x.abs() < 1e-6 { 1.0 } else { x.sin() / x }
-}
-
-/// `exp(2 pi i turns)`.
-pub(super) fn phasor(turns: f64) -> Complex64 {
-    Complex64::cis(TAU * (turns - turns.round()))
 }

@@ -29,6 +29,13 @@ const GROWTH: f64 = 2.0;
 /// Steps of a grid, as a part of a fringe.
 const PART: f64 = 0.25;
 
+/// Products of places and samples in the first grid, whose reach is halved until it has no more: those of 500 wavelengths in a line and 28 pairs are
+/// 2e7. Positions are untrusted.
+const FIRST_MAX: f64 = 1e9;
+
+/// Most steps about the axis by which a grid is finer than the one before, in one of its steps.
+const TURNS_MAX: f64 = 64.0;
+
 /// Longest step about the axis, rad: the Moon may hide a part of the circle.
 const TURN_MAX: f64 = TAU / 12.0;
 
@@ -138,10 +145,15 @@ impl<'a> Search<'a> {
         let mut reach = lengths[(FIRST_SHARE * lengths.len() as f64) as usize].max(FIRST_WAVELENGTHS);
         let everywhere = Place { cosine: 0.0, turn: 0.0, twice_log: 0.0 };
         let mut steps = self.steps(reach);
+        while 8.0 * PI / (steps[0] * steps[1].min(TURN_MAX)) * lengths.len() as f64 > FIRST_MAX {
+            reach *= 0.5;
+            steps = self.steps(reach);
+        }
         let mut best = self.best(about(&everywhere, [1.0, PI], steps), reach, steps);
         while reach < longest {
             reach *= GROWTH;
-            let finer = self.steps(reach);
+            let [step, turn] = self.steps(reach);
+            let finer = [step, turn.max(steps[1] / TURNS_MAX)];
             let places = best.iter().flat_map(|place| about(place, steps, finer)).collect();
             best = self.best(places, reach, finer);
             steps = finer;

@@ -9,9 +9,10 @@ mod flux;
 mod locate;
 mod peel;
 mod refine;
+mod rows;
 
 pub use detect::find_bursts;
-pub use early::{BurstAlert, find_alerts};
+pub use early::{BurstAlert, PassAlerts, find_alerts};
 pub(super) use locate::{Sample, locate};
 pub use peel::LightCurve;
 
@@ -30,6 +31,12 @@ use crate::units::{ChannelId, Dimension};
 
 /// Maximum number of bursts in a table, some 60 MB: 24 a day in 30 channels for a year. Later ones stay in the maps.
 const BURSTS_MAX: usize = 1 << 18;
+
+/// Alerts of a pass in a channel: what else looks like a burst, as an instrument that fails may at any time, is counted.
+const ALERTS_OF_PASS: usize = 8;
+
+/// Alerts, the latest, that a new one may be the same as: those of more than a pass.
+const RECENT_ALERTS: usize = 1024;
 
 /// Maximum memory of all light curves. Bursts beyond it are left out.
 const CURVES_BYTES_MAX: usize = 1 << 26;
@@ -82,7 +89,8 @@ pub struct FoundBurst {
     pub peak_s: f64,
     /// Start and end of the brightest interval, s.
     pub peak_span_s: [f64; 2],
-    /// Signal-to-noise ratio of a point source at the position. The noise is that of the visibilities and the steady sky.
+    /// Signal-to-noise ratio of a point source at the position. The noise is that of the visibilities and the steady sky. NaN, as are flux
+    /// densities, if not determined.
     pub significance: f64,
     /// Mean flux density in the brightest interval, as an isotropic antenna sees it, Jy.
     pub flux_jy: f64,
@@ -146,7 +154,13 @@ impl fmt::Display for FoundBurst {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let hz = Dimension::Frequency.show(self.frequency_hz);
         write!(f, "a burst at {hz} from {:.1} s to {:.1} s: ", self.from_s, self.until_s)?;
-        write!(f, "{:.2e} Jy, {:.0} sigma", self.flux_jy, self.significance)?;
+        match self.flux_jy.is_finite() {
+            true => write!(f, "{:.2e} +- {:.1e} Jy", self.flux_jy, self.flux_sigma_jy)?,
+            false => write!(f, "of unknown flux")?,
+        }
+        if self.significance.is_finite() {
+            write!(f, ", {:.0} sigma", self.significance)?;
+        }
         let first = self.positions_deg.first().zip(self.position_errors_deg.first());
         if let Some(([longitude, latitude], [longer, shorter, _])) = first {
             write!(
@@ -196,6 +210,8 @@ pub struct BurstHours {
     pub frequency_hz: f64,
     /// Number of bursts.
     pub found: u64,
+    /// Number of those without direction: beyond 16 in a pass, or where visibilities do not tell.
+    pub without_direction: u64,
     /// Total length, h.
     pub hours: f64,
     /// What of it is left out of the map, h.
@@ -207,6 +223,7 @@ pub struct BurstHours {
 impl BurstHours {
     fn add(&mut self, burst: &FoundBurst, is_left_out: bool, hats: &[Vec3]) {
         self.found += 1;
+        self.without_direction += u64::from(burst.positions_deg.is_empty());
         self.hours += burst.length_s() / 3600.0;
         if !is_left_out {
             return;
@@ -230,6 +247,7 @@ impl BurstSummary {
             let channel = channels.entry(burst.channel).or_insert_with(|| BurstHours {
                 frequency_hz: burst.frequency_hz,
                 found: 0,
+                without_direction: 0,
                 hours: 0.0,
                 hours_left_out: 0.0,
                 hours_left_out_by_direction: vec![0.0; hats.len()],
@@ -249,13 +267,16 @@ impl fmt::Display for BurstSummary {
             BurstChoice::Off | BurstChoice::Keep => "kept in the maps",
         };
         write!(f, "{} bursts, {what}:", self.found)?;
-        for BurstHours { frequency_hz, found, hours, hours_left_out, hours_left_out_by_direction } in
-            &self.channels
-        {
-            let hz = Dimension::Frequency.show(*frequency_hz);
+        for of_channel in &self.channels {
+            let hz = Dimension::Frequency.show(of_channel.frequency_hz);
+            let BurstHours { found, without_direction, hours, hours_left_out, .. } = of_channel;
             write!(f, "\n  {hz}: {found} bursts, {hours:.2} hours, {hours_left_out:.2} left out")?;
-            let least = hours_left_out_by_direction.iter().copied().fold(f64::INFINITY, f64::min);
-            let most = hours_left_out_by_direction.iter().copied().fold(0.0, f64::max);
+            if *without_direction > 0 {
+                write!(f, ", {without_direction} without direction")?;
+            }
+            let by_direction = || of_channel.hours_left_out_by_direction.iter().copied();
+            let [least, most] =
+                [by_direction().fold(f64::INFINITY, f64::min), by_direction().fold(0.0, f64::max)];
             if most > 0.0 {
                 write!(f, " ({least:.2} to {most:.2} by direction)")?;
             }
@@ -284,6 +305,8 @@ struct BurstTable {
     curves_bytes: usize,
     /// Alerts of this session, before their passes ended.
     alerts: Vec<BurstAlert>,
+    /// Number of those that were not told.
+    untold: u64,
 }
 
 impl BurstTable {
@@ -304,8 +327,15 @@ impl BurstTable {
     /// Whether a burst of a channel has a time in it.
     fn knows(&self, channel: u16, peak_s: f64) -> bool {
         let starts = self.starts.get(&channel).map(Vec::as_slice).unwrap_or_default();
+        let from = starts.partition_point(|(from_s, _)| *from_s < peak_s - self.longest_s);
         let until = starts.partition_point(|(from_s, _)| *from_s <= peak_s);
-        starts[..until].iter().any(|(_, index)| self.bursts[*index].until_s > peak_s)
+        starts[from..until.max(from)].iter().any(|(_, index)| self.bursts[*index].until_s > peak_s)
+    }
+
+    /// Whether an alert is no news.
+    fn has_told(&self, alert: &BurstAlert) -> bool {
+        self.alerts.iter().rev().take(RECENT_ALERTS).any(|other| other.is_same_as(alert))
+            || self.knows(alert.channel, alert.peak_s)
     }
 
     /// The bursts in the time of a block, and perhaps some beside it, without the first `known`, in the order in which they were found.
@@ -351,13 +381,22 @@ impl FoundBursts {
         has_room
     }
 
-    /// Adds an alert, unless there is one of its time, or a burst.
-    pub fn alert(&self, alert: BurstAlert) {
+    /// Adds what a look at an open pass finds in a channel, unless there is an alert of its time, or a burst; of a pass only some.
+    pub fn alert(&self, pass: &mut PassAlerts, found: Vec<BurstAlert>) {
         let mut table = self.table();
-        let is_known = table.alerts.iter().any(|other| other.is_same_as(&alert));
-        if !is_known && !table.knows(alert.channel, alert.peak_s) && table.alerts.len() < BURSTS_MAX {
-            table.alerts.push(alert);
+        let mut untold = 0;
+        for mut alert in found.into_iter().filter(|alert| !table.has_told(alert)).collect::<Vec<_>>() {
+            if pass.told < ALERTS_OF_PASS && table.alerts.len() < BURSTS_MAX {
+                pass.told += 1;
+                alert.is_last = pass.told == ALERTS_OF_PASS;
+                table.alerts.push(alert);
+            } else {
+                untold += 1;
+            }
         }
+        // Each look finds those of the earlier ones again.
+        table.untold += untold.max(pass.untold) - pass.untold;
+        pass.untold = untold.max(pass.untold);
     }
 
     /// Alerts of this session, except the first `seen`.
@@ -370,6 +409,12 @@ impl FoundBursts {
     #[must_use]
     pub fn alerts(&self) -> usize {
         self.table().alerts.len()
+    }
+
+    /// Number of alerts of this session that were not told, as their pass had had enough of them.
+    #[must_use]
+    pub fn untold_alerts(&self) -> u64 {
+        self.table().untold
     }
 
     /// Whether a burst of the table has the peak of another in its time. What was subtracted leaves its power in the weights.

@@ -17,9 +17,9 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::BurstSearch;
-use super::flux::{Flux, Place, Seen, baseline, phasor, sinc};
+use super::flux::{Flux, Seen, affordable};
 use super::locate::Candidate;
-use super::peel::BurstRow;
+use super::rows::{BurstRow, Place, baseline, phasor, sinc};
 use crate::array::{jupiter_hat_by_date, sun_hat_by_date};
 use crate::units::Pair;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};
@@ -41,6 +41,9 @@ const WITHIN: f64 = 9.21;
 
 /// Visibilities of a pair that a direction is found with.
 const OF_PAIR: usize = 32;
+
+/// Work of a fit to them, as [`affordable`] counts it: those of 28 pairs, 25 s long in cells of 0.5 s, are 3e6.
+const WORK_MAX: f64 = 1e7;
 
 /// Least power of a visibility in units of the largest, for a direction.
 const FAINTEST: f64 = 0.03;
@@ -144,7 +147,8 @@ fn bright<'a>(rows: &[BurstRow<'a>], place: Place, span_s: [f64; 2]) -> Option<V
     let some = |rows: &[BurstRow<'a>]| -> Vec<BurstRow<'a>> {
         rows.iter().step_by(rows.len().div_ceil(OF_PAIR).max(1)).copied().collect()
     };
-    Some(of_pairs.flat_map(some).collect())
+    let some: Vec<BurstRow> = of_pairs.flat_map(some).collect();
+    Some(affordable(&some, span_s, WORK_MAX))
 }
 
 /// Peaks of the likelihood near candidates, the likeliest first, and the visibilities as they have the source there.

@@ -1,11 +1,15 @@
 //! Bursts in simulated passes of the default array.
 
+mod arrival;
+mod turning;
+
 use num_complex::Complex64;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::peel::BurstRow;
+use super::flux::Flux;
+use super::rows::{BurstRow, Place};
 use super::*;
 use crate::array::{Array, hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
 use crate::response::beacon::plane_wave;
@@ -58,6 +62,11 @@ fn found(blocks: &[PlacedVisibilities]) -> Vec<FoundBurst> {
 
 fn array() -> Array {
     Array::new(&Default::default()).unwrap()
+}
+
+/// A place whose fringes do not turn in integrations.
+fn place(hat: Vec3, moon_radius_m: f64) -> Place {
+    Place { hat, moon_radius_m, smears: false }
 }
 
 /// A time at which the first daughter sees a direction for 1000 s before and 2000 s after.
@@ -263,7 +272,7 @@ fn alerts_come_while_a_burst_lasts_and_not_without_one() {
             |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { factor * STEADY_K_SR } else { 0.0 };
         let mut blocks = pass(&array, seed, from_s, n_hat, k_sr);
         blocks.retain(|block| block.pair.i < daughters);
-        let bursts = FoundBursts::new(BurstChoice::Keep);
+        let (bursts, mut of_pass) = (FoundBursts::new(BurstChoice::Keep), PassAlerts::default());
         [98, 103, 136, 300].map(|visibilities| {
             let so_far = |block: &PlacedVisibilities| {
                 let mut so_far = block.without_visibilities();
@@ -276,7 +285,7 @@ fn alerts_come_while_a_burst_lasts_and_not_without_one() {
                 alerts.iter().all(|alert| (960.0..1060.0).contains(&(alert.peak_s - from_s))),
                 "{alerts:?}"
             );
-            alerts.into_iter().for_each(|alert| bursts.alert(alert));
+            bursts.alert(&mut of_pass, alerts);
             bursts.alerts()
         })
     };
@@ -297,7 +306,7 @@ fn alerts_come_while_a_burst_lasts_and_not_without_one() {
         );
     let bursts = FoundBursts::new(BurstChoice::Keep);
     found(&blocks).into_iter().for_each(|burst| assert!(bursts.add(burst)));
-    find_alerts(&blocks.iter().collect::<Vec<_>>()).into_iter().for_each(|alert| bursts.alert(alert));
+    bursts.alert(&mut PassAlerts::default(), find_alerts(&blocks.iter().collect::<Vec<_>>()));
     assert_eq!((bursts.len(), bursts.alerts()), (1, 0));
 }
 
@@ -428,7 +437,7 @@ fn where_the_moon_hides_the_fitted_direction_the_burst_is_left_out_too() {
     let across_hat = unit(sub(moon_hat, scale(dot(n_hat, moon_hat), n_hat)));
     let (sin, cos) = 0.5_f64.to_radians().sin_cos();
     let off_hat = add(scale(cos, n_hat), scale(sin, across_hat));
-    let curve = |hat| LightCurve::fit(&rows, hat, span_s, 1_737_100.0).unwrap();
+    let curve = |hat| LightCurve::fit(&rows, place(hat, 1_737_100.0), span_s).unwrap();
     let (right, off) = (curve(n_hat), curve(off_hat));
     let [mut bright_behind, mut used_after] = [0; 2];
     for (block, &k) in blocks.iter().flat_map(|block| ks.iter().map(move |k| (block, k))) {
@@ -490,7 +499,7 @@ fn a_light_curve_is_that_of_dense_least_squares() {
     let blocks: Vec<PlacedVisibilities> = ROWS.iter().map(block).collect();
     let row = |(block, row): (_, &Row)| BurstRow { block, k: 0, steady_k2_sr2: row.5 };
     let rows: Vec<BurstRow> = blocks.iter().zip(&ROWS).map(row).collect();
-    let curve = LightCurve::fit(&rows, [0.0, 0.0, 1.0], [0.0, 4.0], 1e6).unwrap();
+    let curve = LightCurve::fit(&rows, place([0.0, 0.0, 1.0], 1e6), [0.0, 4.0]).unwrap();
     assert_eq!((curve.cells(), curve.unexplained_s()), (2, 0.0));
     for (block, ([re, im], weight)) in blocks.iter().zip(WITHOUT) {
         let (found, found_weight) = curve.without_burst(block, 0).unwrap();
@@ -502,13 +511,13 @@ fn a_light_curve_is_that_of_dense_least_squares() {
     let behind = PlacedVisibilities { r_i_m: vec![[0.0, 0.0, -2e6]], ..blocks[0].clone() };
     assert_eq!(curve.without_burst(&behind, 0), Some((behind.value_k_sr[0], behind.weight[0])));
     // A cell without visibilities is not explained.
-    let longer = LightCurve::fit(&rows, [0.0, 0.0, 1.0], [0.0, 12.0], 1e6).unwrap();
+    let longer = LightCurve::fit(&rows, place([0.0, 0.0, 1.0], 1e6), [0.0, 12.0]).unwrap();
     assert_eq!((longer.cells(), longer.unexplained_s()), (6, 6.0));
     // A source elsewhere leaves more than noise.
     let mut bright = blocks.clone();
     bright.iter_mut().for_each(|block| block.value_k_sr[0] *= 30.0);
     let rows: Vec<BurstRow> = bright.iter().zip(&ROWS).map(row).collect();
-    let elsewhere = LightCurve::fit(&rows, [1.0, 0.0, 0.0], [0.0, 4.0], 1e6).unwrap();
+    let elsewhere = LightCurve::fit(&rows, place([1.0, 0.0, 0.0], 1e6), [0.0, 4.0]).unwrap();
     assert_eq!(elsewhere.unexplained_s(), 4.0);
     assert!(elsewhere.without_burst(&bright[0], 0).is_none());
 }

@@ -16,9 +16,9 @@ use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
-const MAGIC: &[u8; 8] = b"LNRSTA12";
+const MAGIC: &[u8; 8] = b"LNRSTA13";
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of version 12; earlier ones lack errors of gains and of bursts, or more: make a new state \
+const VERSION: &str = "a checkpoint of version 13; earlier ones lack how fringes of bursts turn, or more: make a new state \
 with `lunarray rebuild`, or replay the files into a new folder";
 /// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;
@@ -466,14 +466,14 @@ mod tests {
     #[test]
     fn an_earlier_version_is_refused_and_says_what_to_do() {
         with_head(|head| {
-            for earlier in [b"LNRSTA10", b"LNRSTA11"] {
+            for earlier in [b"LNRSTA10", b"LNRSTA11", b"LNRSTA12"] {
                 let mut old = written(head);
                 old[..8].copy_from_slice(earlier);
                 let body = old.len() - 8;
                 let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
                 old[body..].copy_from_slice(&crc.to_le_bytes());
                 let said = read_back(&old).unwrap_err().to_string();
-                let is_said = said.contains("a checkpoint of version 12;") && MAGIC.ends_with(b"12");
+                let is_said = said.contains("a checkpoint of version 13;") && MAGIC.ends_with(b"13");
                 assert!(is_said && said.contains("replay the files into a new folder"), "{said}");
             }
         });

@@ -49,7 +49,7 @@
 //! [`crate::ground::Ground::rebuild`] makes a new state from the raw archive alone.
 //!
 //! # A checkpoint
-//! The format is: magic `LNRSTA12`; length of the head (u64 LE); head (bincode); the sums of the channels in the format of
+//! The format is: magic `LNRSTA13`; length of the head (u64 LE); head (bincode); the sums of the channels in the format of
 //! their engine; CRC-64/NVME of all that (u64 LE). It is written under another name, synced and renamed. The previous
 //! checkpoint is kept, and used with a note if the newest is damaged, that is, if its checksum or contents are wrong. A
 //! read error of the system is an error, and the folder stays unchanged.
