@@ -211,7 +211,11 @@ impl fmt::Display for ChannelSummary {
             let l_max = rho.len().saturating_sub(1).min(2 * self.nside);
             let step = (l_max / 8).max(1);
             for l in (step..=l_max).step_by(step) {
-                write!(f, "  {l}: {:.3}", rho[l])?;
+                // Where the noise is larger than the map there is no such number.
+                match rho[l] {
+                    found if found.is_finite() => write!(f, "  {l}: {found:.3}")?,
+                    _ => write!(f, "  {l}: -")?,
+                }
             }
         }
         Ok(())

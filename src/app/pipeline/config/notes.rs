@@ -164,7 +164,7 @@ impl Config {
     /// A note if the mission is too short for the errors of harmonic maps.
     fn coverage_note(&self) -> Option<String> {
         let is_harmonic =
-            self.map.method() == Method::Harmonic && self.map.regulariser == RegulariserChoice::Data;
+            self.map.method() == Method::Harmonic && self.map.regulariser() == RegulariserChoice::Data;
         (is_harmonic && self.has_short_coverage()).then(|| {
             format!(
                 "in spacecraft.duration_s = {} the node turns by {:.1} of 360 deg: errors, mask and C_l of harmonic maps with R from the data are \

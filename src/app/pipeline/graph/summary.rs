@@ -322,7 +322,10 @@ impl fmt::Display for RunSummary {
             writeln!(f, "\nJoint maps\n{joint}")?;
         }
         if self.lacks_maps() {
-            write!(f, "Ended early, and maps are missing: runtime.grace_s left no time for them.")?;
+            write!(
+                f,
+                "Ended early: runtime.grace_s left no time for all maps. Maps of channels that are not listed are missing or without all products."
+            )?;
         } else if self.cancelled && !self.report.cancelled {
             write!(f, "Ended early, without joint maps: all other products are complete.")?;
         } else if self.cancelled {
