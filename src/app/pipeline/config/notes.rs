@@ -139,11 +139,12 @@ impl Config {
         let (radius_m, inclination_rad) =
             (array.moon_radius_m + array.altitude_m, array.inclination_deg.to_radians());
         let motion = (MOON_GM_M3_S2 / radius_m.powi(3)).sqrt();
-        let rate = -1.5 * motion * MOON_J2 * (MOON_J2_RADIUS_M / radius_m).powi(2) * inclination_rad.cos();
+        let fastest = 1.5 * motion * MOON_J2 * (MOON_J2_RADIUS_M / radius_m).powi(2)
+            / (1.0 - array.eccentricity.powi(2)).powi(2);
+        let rate = -fastest * inclination_rad.cos();
         let sign = if array.node_motion == NodeMotion::Regress { -1.0 } else { 1.0 };
         let given = sign * TAU / array.precession_period_s;
-        // At 90 degrees the node stands still, within the tolerance of the default orbit.
-        let fastest = 1.5 * motion * MOON_J2 * (MOON_J2_RADIUS_M / radius_m).powi(2);
+        // Relative to the rate of an equatorial orbit, as that at 90 degrees is 0.
         ((given - rate).abs() > PRECESSION_TOLERANCE * fastest).then(|| {
             let turns = match TAU / rate.abs() {
                 period_s if rate.abs() < 1e-3 * fastest || !period_s.is_finite() => "hardly turns the node".to_owned(),
@@ -166,9 +167,13 @@ impl Config {
         let is_harmonic =
             self.map.method() == Method::Harmonic && self.map.regulariser() == RegulariserChoice::Data;
         (is_harmonic && self.has_short_coverage()).then(|| {
+            let remedy = match self.is_better_in_pixels() {
+                true => "; map.engine = \"pixel\" states better ones",
+                false => "",
+            };
             format!(
-                "in spacecraft.duration_s = {} the node turns by {:.1} of 360 deg: errors, mask and C_l of harmonic maps with R from the data are \
-                 wrong then (errors 6 times too small after a week); map.engine = \"pixel\" states better ones",
+                "in spacecraft.duration_s = {} the node turns by {:.1} of 360 deg: errors, mask and C_l of harmonic maps with R from the \
+                 data are wrong then (errors 6 times too small after a week){remedy}",
                 self.spacecraft.duration_s,
                 360.0 * self.spacecraft.duration_s / self.array.precession_period_s,
             )
@@ -275,12 +280,19 @@ mod tests {
             assert_eq!(engine, EngineKind::Harmonic);
             assert!(notes.len() == 1 && notes[0].contains("the node turns by 5.3 of 360 deg"), "{notes:?}");
         }
-        // More than a twelfth of a turn, and a key that pixels do not have.
+        // 7 days of 30 channels, more than a twelfth of a turn, and a key that pixels do not have.
         assert_eq!(
             engine(&|config| config.spacecraft.duration_s = 40.0 * DAY_S),
             (EngineKind::Harmonic, Vec::new())
         );
         assert_eq!(engine(&|config| config.map.l_max = 30).0, EngineKind::Harmonic);
+        assert_eq!(
+            engine(
+                &|config| config.spacecraft.channels_hz = (1..31).map(|mhz| 1e6 * f64::from(mhz)).collect()
+            )
+            .0,
+            EngineKind::Harmonic
+        );
     }
 
     #[test]

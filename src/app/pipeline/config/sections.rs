@@ -18,14 +18,16 @@ use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
+use crate::units::constants::DAY_S;
 use crate::units::time_scales::utc_text;
 use crate::units::{ChannelId, Checks, InvalidValue, keys};
 
-/// Turn of the node, of a circle, below which C_l and errors of harmonic maps with R from the data do not hold. Squares of (map - sky) / sigma:
-/// 40 after a week (nside 16), 56 after a month (nside 4), with pixels 2.8 and 4.6 after a week.
+/// Turn of the node, of a circle, below which C_l and errors of harmonic maps with R from the data do not hold. Mean squares of (map - sky) /
+/// sigma after a week: 40 at nside 16 and 10,000 at nside 4; of pixel maps of the same data 2.8 and 4.6.
 const NODE_TURN_MIN: f64 = 1.0 / 12.0;
-/// nside up to which a pixel map of so short a mission takes minutes.
+/// nside up to which a pixel map of so short a mission takes minutes, and days of data of all channels: 40 of three take two.
 const SHORT_NSIDE_MAX: usize = 16;
+const CHANNEL_DAYS_MAX: f64 = 120.0;
 
 keys! {
     /// A whole pipeline: the sky, the spacecraft and the ground.
@@ -217,14 +219,21 @@ impl Config {
     }
 
     /// Whether the node turns so little that errors of harmonic maps do not hold, and pixel maps are possible and take minutes.
-    fn is_better_in_pixels(&self) -> bool {
+    pub(super) fn is_better_in_pixels(&self) -> bool {
         let problems = |engine: EngineKind| {
             let mut config = self.clone();
             config.map.engine = engine;
-            config.problems().len()
+            config.problems().iter().filter(|problem| problem.to_string().starts_with("map.")).count()
         };
+        let Self { spacecraft, map, .. } = self;
+        let channels = (0..).map(ChannelId).zip(&spacecraft.channels_hz).filter(|(id, _)| map.is_mapped(*id));
+        let integrations = spacecraft.every_nth_integration.values().iter().min().copied().unwrap_or(1);
+        let thinned: f64 =
+            [spacecraft.thin, spacecraft.every_nth_window, integrations].map(|n| n as f64).iter().product();
+        let channel_days = channels.count() as f64 * spacecraft.duration_s / DAY_S / thinned;
         self.has_short_coverage()
-            && self.map.nside <= SHORT_NSIDE_MAX
+            && map.nside <= SHORT_NSIDE_MAX
+            && channel_days <= CHANNEL_DAYS_MAX
             && !self.joint.on
             && problems(EngineKind::Pixel) <= problems(EngineKind::Harmonic)
     }

@@ -29,7 +29,7 @@ pub enum NodeMotion {
 keys! {
     /// Orbit and formation; the defaults are the paper's fiducial array.
     pub struct ArrayConfig {
-        /// Number of daughters on the circle.
+        /// Number of daughters on the circle, 3 to 64.
         everyday satellites: usize = 8;
         /// Altitude of the circular orbit, or of the semi-major axis.
         #[only_with("no array.kepler and no array.oem and no array.stations")]

@@ -6,7 +6,7 @@
 //! ```
 //!
 //! L is the number of e-foldings of frequency over which the structure is correlated, p the fraction of power that is independent in each
-//! channel, a what the amplitudes of the channels lack of each other's. ln L, logit p and a are linear in ln(l + 1) between knots an octave apart.
+//! channel, a a correction of the root of C_l by what the channels say of each other. ln L, logit p and a are linear in ln(l + 1) between knots an octave apart.
 
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::{Mat, Par, Side};
@@ -18,11 +18,11 @@ use crate::imaging::power::{FREE_DEGREES, Hyperprior, Knots};
 /// Prior mean and standard deviation of ln L: spectra of the sky bend over an e-folding or several.
 const LN_LENGTH: [f64; 2] = [0.7, 1.0];
 /// Prior mean (p = 1 %) and standard deviation of logit p.
-const LOGIT_OWN_SHARE: [f64; 2] = [-4.6, 3.0];
+const LOGIT_OWN_SHARE: [f64; 2] = [-4.6, 1.0];
 /// Prior standard deviation of the amplitudes a, about that of C_l from a channel alone.
-const AMPLITUDE_SIGMA: f64 = 0.7;
+const AMPLITUDE_SIGMA: f64 = 0.15;
 /// Prior standard deviations of the changes of ln L, logit p and a from knot to knot.
-const CHANGE_SIGMA: [f64; 3] = [0.7, 1.0, 0.35];
+const CHANGE_SIGMA: [f64; 3] = [0.7, 1.0, 0.15];
 /// Parameters of a knot before the amplitudes: ln L and logit p.
 const AMPLITUDES_FROM: usize = 2;
 
@@ -114,8 +114,10 @@ impl Covariance {
 
     /// The correlation at every knot.
     pub(super) fn at_knots(&self) -> Vec<Correlation> {
-        let degrees = (0..self.knots.count()).map(|knot| Knots::degree(knot).min(self.l_max));
-        degrees.map(|l| self.correlation(l)).collect()
+        let mut degrees: Vec<usize> =
+            (0..self.knots.count()).map(|knot| Knots::degree(knot).min(self.l_max)).collect();
+        degrees.dedup();
+        degrees.into_iter().map(|l| self.correlation(l)).collect()
     }
 
     /// `F^-1 dC F^-T` of the first `count` channels for each parameter at a degree, C the covariance and F its Cholesky factor.
@@ -148,7 +150,8 @@ impl Covariance {
     }
 
     /// Gradient and Fisher information of the log evidence and the prior of the parameters, from what the data say of the unknowns at each
-    /// degree; `factors` are the covariance's Cholesky factors. The information leaves out that degrees share data.
+    /// degree; `factors` are the covariance's Cholesky factors. The information averages over orders, and
+    /// leaves out that degrees share data.
     pub(super) fn derivatives(&self, factors: &[Mat<f64>], moments: &[Moments]) -> (Vec<f64>, Mat<f64>) {
         let Hyperprior { mut gradient, precision: mut information, .. } = self.hyperprior();
         for (l, found) in moments.iter().enumerate().skip(FREE_DEGREES) {

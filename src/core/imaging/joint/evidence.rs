@@ -12,8 +12,8 @@ use crate::imaging::solver::NamedWatch;
 /// Correlation lengths and independent shares of the grid on which the search begins.
 const LENGTHS: [f64; 3] = [0.7, 2.0, 6.0];
 const OWN_SHARES: [f64; 3] = [1e-3, 1e-2, 1e-1];
-/// Gain in evidence below which the search ends; `maximise` has the same.
-const GAIN_MIN: f64 = 1e-4;
+/// Gain in evidence per step below which the search ends: parameters are then within a small part of their errors.
+const GAIN_MIN: f64 = 0.1;
 
 /// The prior of maximum evidence: from the best of a grid of parameters that are the same at all degrees, by Newton's iteration.
 pub(super) fn most_likely(
@@ -40,7 +40,7 @@ pub(super) fn most_likely(
         Some(prior.derivatives(&moments(&prior, scaled, rights)?))
     };
     let goes_on = |step: usize, gain: f64| task.report_step(true, step, gain);
-    let theta = maximise(start, &objective, &derivatives, &goes_on).ok_or(SolveError::NoPower)?;
+    let theta = maximise((start, GAIN_MIN), &objective, &derivatives, &goes_on).ok_or(SolveError::NoPower)?;
     initial.with_theta(&theta)
 }
 

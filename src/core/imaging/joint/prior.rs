@@ -10,6 +10,8 @@ use crate::imaging::unknowns::{degrees_orders_parts, index_of};
 
 /// Independent fraction of the free degrees: the smallest for which correlations of close channels have a Cholesky factor.
 const FREE_INDEPENDENT_FRACTION: f64 = 1e-6;
+/// Least correlation length of the free degrees: with a shorter one nothing of the neighbours would reach frequencies between them.
+const FREE_LENGTH_MIN: f64 = 0.3;
 
 /// The prior of several channels, `x = T u` with standard normal u. Channels are in order of decreasing l_max, so that the channels with a
 /// given degree come first.
@@ -183,8 +185,12 @@ impl Prior {
         free: &[[f64; FREE_DEGREES]],
     ) -> Result<(Vec<f64>, f64), SolveError> {
         let own = self.covariance.correlation(l);
-        let correlation =
-            if l < FREE_DEGREES { Correlation { own_share: FREE_INDEPENDENT_FRACTION, ..own } } else { own };
+        let smooth = || Correlation {
+            own_share: FREE_INDEPENDENT_FRACTION,
+            length: own.length.max(FREE_LENGTH_MIN),
+            ..own
+        };
+        let correlation = if l < FREE_DEGREES { smooth() } else { own };
         let factor = correlation.cholesky_factor(given)?;
         let shares = conditional(&factor, correlation, given, frequency_hz);
         let left = (1.0 - shares.iter().map(|q| q * q).sum::<f64>()).max(0.0);

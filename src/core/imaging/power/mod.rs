@@ -42,6 +42,9 @@ use crate::sky::healpix::pixel_count;
 
 /// Decades of amplitude that are searched, in units of the smallest noise variance.
 const DECADES: std::ops::RangeInclusive<i32> = -3..=13;
+/// Gain in evidence per step below which the iteration ends.
+const GAIN_MIN: f64 = 1e-4;
+
 /// Limit of the `V'N^-1V` that C_l predicts for degrees from 2 on, in units of that of the data. Rounds of data that leave most of the sky open
 /// could otherwise run away: a larger C_l makes a larger map, which makes a larger C_l. Beyond it a narrow Gaussian prior in the logarithm sets in.
 const EXPECTED_MAX: f64 = 30.0;
@@ -379,8 +382,12 @@ impl PowerFit {
             }
             Some((gradient, information))
         };
-        let found =
-            maximise(self.theta.clone(), &|theta| self.objective(theta, data), &derivatives, &|_, _| true);
+        let found = maximise(
+            (self.theta.clone(), GAIN_MIN),
+            &|theta| self.objective(theta, data),
+            &derivatives,
+            &|_, _| true,
+        );
         found.map(|theta| at(&theta)).ok_or(SolveError::NoPower)
     }
 

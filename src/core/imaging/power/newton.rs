@@ -5,8 +5,6 @@ use faer::{Mat, Side};
 
 /// Maximum number of steps.
 const STEPS_MAX: usize = 20;
-/// Gain per step below which the iteration ends.
-const GAIN_MIN: f64 = 1e-4;
 /// Maximum change of a parameter in one step.
 const STEP_MAX: f64 = 2.0;
 /// Maximum number of halvings of a step without gain.
@@ -15,9 +13,10 @@ const HALVINGS: usize = 8;
 /// Gradient and information, the negative second derivative or an approximation of it.
 pub(in crate::imaging) type Derivatives = (Vec<f64>, Mat<f64>);
 
-/// Maximises `objective` from `start`; `None` if it or its derivatives do not exist there. `goes_on` hears of every step and its gain.
+/// Maximises `objective` from `start` until a step gains less than `gain_min`; `None` if it or its derivatives do not exist there. `goes_on` hears
+/// of every step and its gain.
 pub(in crate::imaging) fn maximise(
-    start: Vec<f64>,
+    (start, gain_min): (Vec<f64>, f64),
     objective: &dyn Fn(&[f64]) -> Option<f64>,
     derivatives: &dyn Fn(&[f64]) -> Option<Derivatives>,
     goes_on: &dyn Fn(usize, f64) -> bool,
@@ -44,7 +43,7 @@ pub(in crate::imaging) fn maximise(
         let Some((found, trial)) = improved else { break };
         let gain = found - best;
         (best, theta) = (found, trial);
-        if gain < GAIN_MIN || !goes_on(number + 1, gain) {
+        if gain < gain_min || !goes_on(number + 1, gain) {
             break;
         }
     }
