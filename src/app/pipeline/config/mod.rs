@@ -3,6 +3,7 @@
 mod channel_lists;
 mod downlink_settings;
 mod effects;
+mod engine;
 mod error;
 mod file_problems;
 mod key_list;
