@@ -5,8 +5,8 @@ use crate::imaging::EngineKind;
 use crate::units::ChannelId;
 use crate::units::constants::DAY_S;
 
-/// Turn of the node, of a circle, below which C_l and errors of harmonic maps with R from the data do not hold. Mean squares of (map - sky) /
-/// sigma after a week: 40 at nside 16 and 10,000 at nside 4; of pixel maps of the same data 2.8 and 4.6.
+/// Turn of the node, of a circle, below which C_l and errors of harmonic maps with R from the data may not hold. Mean squares of (map - sky) /
+/// sigma: 40 after a week and 1.4 after a month at nside 16, 10,000 after a week at nside 4; of pixel maps of the weeks 2.8 and 4.6.
 const NODE_TURN_MIN: f64 = 1.0 / 12.0;
 /// nside up to which a pixel map of so short a mission takes minutes, and days of data of all channels: 40 of three take two.
 const SHORT_NSIDE_MAX: usize = 16;
@@ -23,7 +23,7 @@ impl Config {
         }
     }
 
-    /// Whether the node turns so little that errors of harmonic maps do not hold, and pixel maps are possible and take minutes.
+    /// Whether the node turns so little that errors of harmonic maps may not hold, and pixel maps are possible and take minutes.
     pub(super) fn is_better_in_pixels(&self) -> bool {
         let problems = |engine: EngineKind| {
             let mut config = self.clone();

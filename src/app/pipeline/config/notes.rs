@@ -149,7 +149,7 @@ impl Config {
             let turns = match TAU / rate.abs() {
                 period_s if rate.abs() < 1e-3 * fastest || !period_s.is_finite() => "hardly turns the node".to_owned(),
                 period_s => format!(
-                    "turns the node once in {period_s:.3e} s, array.node_motion = {}",
+                    "turns the node once in {period_s:.3e} s (array.node_motion = {})",
                     if rate < 0.0 { "\"regress\"" } else { "\"advance\"" }
                 ),
             };
@@ -173,7 +173,7 @@ impl Config {
             };
             format!(
                 "in spacecraft.duration_s = {} the node turns by {:.1} of 360 deg: errors, mask and C_l of harmonic maps with R from the \
-                 data are wrong then (errors 6 times too small after a week){remedy}",
+                 data may be wrong (at nside 16 errors 6 times too small after a week, 1.2 times after a month){remedy}",
                 self.spacecraft.duration_s,
                 360.0 * self.spacecraft.duration_s / self.array.precession_period_s,
             )
