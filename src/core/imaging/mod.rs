@@ -44,7 +44,8 @@ pub mod zoom;
 pub use beyond::read_power;
 #[doc(hidden)]
 pub use circle::{
-    HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_noises, solve_regularised,
+    EVEN_SHARE, HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, WHOLE_UNKNOWNS_MAX, harmonic_beams,
+    solve_noises, solve_regularised,
 };
 pub use config::MapConfig;
 #[doc(hidden)]

@@ -54,7 +54,10 @@ pub(super) fn limits(diagnostics: &Diagnostics, refinement: Option<&Refinement>)
         (None, Some(_)) if diagnostics.is_of_pixels => {
             "all degrees; may be too small for few data: lunarray sample"
         }
-        (None, Some(_)) => "degrees up to l_max; may be too small for few data: lunarray sample",
+        (None, Some(_)) if diagnostics.errors_may_mislead => {
+            "degrees up to l_max; far too small: the node has not turned evenly"
+        }
+        (None, Some(_)) => "degrees up to l_max",
         (None, None) => "all degrees, also those beyond the map's",
     }
 }
@@ -98,9 +101,12 @@ mod tests {
     fn limits_fit_into_a_line_of_a_header() {
         let convergence = Some(Convergence { iterations: 1, residual: 0.0, converged: true });
         for (convergence, is_of_pixels) in [(convergence, true), (convergence, false), (None, true)] {
-            let diagnostics = Diagnostics { convergence, is_of_pixels, ..Diagnostics::default() };
-            let found = limits(&diagnostics, None);
-            assert!(found.len() <= 68, "{found}");
+            for errors_may_mislead in [false, true] {
+                let diagnostics =
+                    Diagnostics { convergence, is_of_pixels, errors_may_mislead, ..Diagnostics::default() };
+                let found = limits(&diagnostics, None);
+                assert!(found.len() <= 68, "{found}");
+            }
         }
     }
 

@@ -44,6 +44,7 @@ mod sums;
 #[cfg(test)]
 mod tests;
 mod tori;
+mod whole;
 mod workspace;
 
 use std::io::Read;
@@ -69,6 +70,7 @@ pub(super) use sigma::{moments, moments_k, resolution_deg, sample, view_sigma_k}
 pub use solve::{HarmonicRequest, HarmonicSolution, solve_regularised};
 pub(super) use solve::{largest_of_circle, prior_unknowns};
 pub use sums::HarmonicSums;
+pub use whole::{EVEN_SHARE, WHOLE_UNKNOWNS_MAX};
 
 use self::checkpoint::HarmonicHead;
 use self::exact::{ExactTori, SCALES_MAX};

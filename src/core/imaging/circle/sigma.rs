@@ -8,8 +8,9 @@ use rayon::prelude::*;
 
 use super::blocks::orders_of;
 use crate::imaging::power::{Block, Factors, Sample};
-use crate::imaging::unknowns::degrees;
+use crate::imaging::unknowns::{degrees, degrees_orders_parts};
 use crate::sky::healpix::pixel_directions;
+use crate::units::vector::Vec3;
 
 /// Standard deviations, K, of the pixels of a map, HEALPix RING; `ratio` is that of traces, by degree.
 pub(super) fn pixel_sigma_k(
@@ -81,6 +82,11 @@ pub(in crate::imaging) fn view_sigma_k(
     open: &[f64],
     nside: usize,
 ) -> Vec<f64> {
+    if let [block] = blocks
+        && block.places.len() == 1
+    {
+        return whole_sigma_k(block, factors, weight, open, nside);
+    }
     let z: Vec<f64> = pixel_directions(nside).iter().map(|direction| direction[2]).collect();
     let rings: Vec<&[f64]> = z.chunk_by(|a, b| a == b).collect();
     let l_max = blocks.iter().flat_map(|block| &block.degrees).copied().max().unwrap_or(0);
@@ -117,6 +123,40 @@ pub(in crate::imaging) fn view_sigma_k(
     }
     let of_ring = |(ring, variance): (&&[f64], &f64)| std::iter::repeat_n(variance.sqrt(), ring.len());
     rings.iter().zip(&variances).flat_map(of_ring).collect()
+}
+
+/// The same of one block of all unknowns, whose variances depend on the longitude, too.
+fn whole_sigma_k(
+    block: &Block<'_>,
+    factors: &Factors<'_>,
+    weight: &(dyn Fn(usize, usize) -> f64 + Sync),
+    open: &[f64],
+    nside: usize,
+) -> Vec<f64> {
+    let directions = pixel_directions(nside);
+    let rings: Vec<&[Vec3]> = directions.chunk_by(|a, b| a[2] == b[2]).collect();
+    let l_max = block.degrees.iter().copied().max().unwrap_or(0);
+    let of_degree =
+        |(l, variance): (usize, &f64)| (2 * l + 1) as f64 / (4.0 * std::f64::consts::PI) * variance;
+    let open: f64 = open.iter().enumerate().map(of_degree).sum();
+    let of_ring = |ring: &&[Vec3]| -> Vec<f64> {
+        let lambda: Vec<Vec<f64>> = (0..=l_max).map(|m| legendre(m, l_max, ring[0][2])).collect();
+        let unknowns: Vec<(usize, usize, usize)> = degrees_orders_parts(l_max).collect();
+        let values = Mat::from_fn(unknowns.len(), ring.len(), |row, column| {
+            let (l, m, part) = unknowns[row];
+            let angle = m as f64 * ring[column][1].atan2(ring[column][0]);
+            let turn = match (m, part) {
+                (0, _) => 1.0,
+                (_, 0) => std::f64::consts::SQRT_2 * angle.cos(),
+                _ => -std::f64::consts::SQRT_2 * angle.sin(),
+            };
+            // The sign of Condon and Shortley.
+            let sign = if m % 2 == 0 { 1.0 } else { -1.0 };
+            sign * weight(0, l) * lambda[m][l - m] * turn
+        });
+        factors.quadratic_forms(0, values).iter().map(|variance| (open + variance).sqrt()).collect()
+    };
+    rings.par_iter().flat_map_iter(of_ring).collect()
 }
 
 /// `Y_lm(theta, 0)` for l = m ..= l_max at `z = cos theta`.

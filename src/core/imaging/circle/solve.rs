@@ -1,6 +1,7 @@
 //! Solves the regularised normal equations over harmonic coefficients.
 
 use super::posterior::Posterior;
+use super::whole::PowerEquations;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::imaging::SolveError;
 use crate::imaging::power::{MapsWithPower, PowerProblem, Samples, Uncertainty};
@@ -161,16 +162,18 @@ fn solve_with_power(
     let l_max = sums.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
     let right = right_hand_side(sums, prior.as_deref())?;
-    let order_blocks = sums.order_blocks();
-    let (blocks, degrees) = (order_blocks.blocks(), degrees(l_max).collect::<Vec<usize>>());
+    let equations = PowerEquations::new(sums, &right, prior.as_deref(), watch);
+    let (blocks, degrees) = (equations.blocks(), degrees(l_max).collect::<Vec<usize>>());
     let SumCounts { visibilities, power, .. } = sums.counts();
+    let data_chi2 = power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right));
+    let (sums, right) = (equations.sums(), equations.right(&right));
     let problem = PowerProblem {
         sums,
         blocks: &blocks,
         coupling: None,
         degrees: &degrees,
-        right: &right,
-        data_chi2: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),
+        right,
+        data_chi2,
         data_count: 2.0 * visibilities as f64,
     };
     let MapsWithPower { found, columns, convergence } = problem.solve_maps(start, rule, watch)?;
@@ -184,7 +187,7 @@ fn solve_with_power(
         sums,
         blocks: &blocks,
         found: &found,
-        right: &right,
+        right,
         solved: &solved,
         whole: &whole,
         nside,
@@ -193,7 +196,8 @@ fn solve_with_power(
     };
     let errors = || posterior.uncertainty(samples, &|x| sums.apply_all(x));
     let uncertainty = watch.is_of_final_map().then(errors).transpose()?;
-    let diagnostics = Diagnostics::of_power(l_max, &convergence);
+    let errors_may_mislead = equations.may_mislead();
+    let diagnostics = Diagnostics { errors_may_mislead, ..Diagnostics::of_power(l_max, &convergence) };
     Ok(HarmonicSolution {
         map_k: map(&whole)?,
         noise_k: map(&noise)?,

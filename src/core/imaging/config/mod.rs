@@ -96,8 +96,7 @@ keys! {
         /// "harmonic").
         everyday nside: usize = 16;
         /// Map method: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or with map.refine; or
-        /// "auto": "harmonic" for a circle of section `array`, unless positions are solved for, a key of pixel maps is set, or nside is at most
-        /// 16 and the node turns by less than 30 deg.
+        /// "auto": "harmonic" for a circle of section `array`, unless positions are solved for or a key of pixel maps is set.
         everyday engine: EngineKind = EngineKind::Auto;
         /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
         expert channels_max: usize = 64;

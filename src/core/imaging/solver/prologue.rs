@@ -26,6 +26,9 @@ pub struct Diagnostics {
     /// Whether pixels are solved for by their harmonics, so that errors include the sky's degrees beyond these.
     #[serde(skip)]
     pub is_of_pixels: bool,
+    /// Whether C_l and errors rest on blocks that are not near the matrix, as the node of the orbit has not turned evenly: these may be far from true.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub errors_may_mislead: bool,
     /// Convergence of the map; absent after a factorisation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub convergence: Option<Convergence>,

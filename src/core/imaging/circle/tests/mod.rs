@@ -2,6 +2,7 @@ mod coverage;
 mod gain_errors;
 mod resolution;
 mod shared;
+mod whole;
 
 use std::time::Duration;
 

@@ -1,0 +1,258 @@
+//! BtN^-1B as one matrix, for orbits whose node has not turned evenly.
+//!
+//! The blocks that are diagonal in m are the whole matrix once the node has turned evenly. Until then they are far from it: powers, errors and
+//! samples that rest on them are wrong, and iterations that they precondition do not converge.
+//!
+//! Few visibilities at few nodes of the orbit also show what gridding does to the matrix. Its eigenvalues, none of which is negative in truth,
+//! go down to some -1e-5 of the largest. Such errors E change the right-hand side by E x, which counts as noise of variance `eta^2` in each
+//! unknown: with `A = U diag(a) U'` the equations become `U diag(a^2 / (a + eta^2)) U' x = U diag(a / (a + eta^2)) U' b`, whose right-hand side
+//! has the matrix as its covariance, as that of exact equations has.
+
+use std::borrow::Cow;
+
+use faer::{Mat, Side};
+
+use super::grid::ALPHAS;
+use super::stored::TorusPart;
+use super::{HarmonicSums, OrderBlocks, degrees};
+use crate::imaging::power::Block;
+use crate::imaging::solver::NamedWatch;
+use crate::imaging::{Accuracy, NormalSums, SumCounts};
+
+/// Columns that are made at once: a thread has a workspace for each.
+const COLUMNS: usize = 8;
+
+/// Eigenvalues above this multiple of the most negative one are accurate enough for a first estimate of the sky's norm.
+const ACCURATE: f64 = 30.0;
+
+/// Unknowns up to which a matrix is made, some l_max = 49: it takes as many products as these.
+pub const WHOLE_UNKNOWNS_MAX: usize = 2_500;
+
+/// Covered share of the node's turn below which the blocks are not near the matrix. Mean squares of (map - sky) / sigma at nside 8 and 16, by the
+/// blocks and by the matrix: 1.4 and 1.3 for shares of 0.8, 1.3 and 1.2 of 0.65, 1.1 and 1.0 of 0.5, 2.7 and 1.3 of 0.35, 270 and 1.9 of 0.02.
+pub const EVEN_SHARE: f64 = 0.6;
+
+/// The equations of a map with R from the data.
+pub(super) enum PowerEquations<'a> {
+    /// With blocks near their matrix.
+    ByOrder { sums: &'a HarmonicSums, blocks: OrderBlocks },
+    /// With their whole matrix.
+    Whole(WholeSums<'a>),
+}
+
+/// Equations whose matrix is stored, with what gridding did to it as noise.
+pub(super) struct WholeSums<'a> {
+    sums: &'a HarmonicSums,
+    matrix: Mat<f64>,
+    right: Vec<f64>,
+    noise: Vec<f64>,
+    gain_errors: Vec<Vec<f64>>,
+}
+
+impl<'a> PowerEquations<'a> {
+    /// Equations for what the data say beside `prior`, with this right-hand side.
+    pub(super) fn new(
+        sums: &'a HarmonicSums,
+        right: &[f64],
+        prior: Option<&[f64]>,
+        watch: NamedWatch<'_>,
+    ) -> Self {
+        let is_whole = watch.is_of_final_map()
+            && sums.unknowns() <= WHOLE_UNKNOWNS_MAX
+            && sums.is_node_even() == Some(false);
+        let whole = is_whole.then(|| WholeSums::new(sums, right, prior, watch)).flatten();
+        whole.map_or_else(|| Self::ByOrder { sums, blocks: sums.order_blocks() }, Self::Whole)
+    }
+
+    /// Whether C_l and errors may be far from true: the node has not turned evenly, and the matrix is too large to be stored.
+    pub(super) fn may_mislead(&self) -> bool {
+        matches!(self, Self::ByOrder { sums, .. } if sums.is_node_even() == Some(false))
+    }
+
+    pub(super) fn sums(&self) -> &dyn NormalSums {
+        match self {
+            Self::ByOrder { sums, .. } => *sums,
+            Self::Whole(whole) => whole,
+        }
+    }
+
+    pub(super) fn right<'b>(&'b self, of_sums: &'b [f64]) -> &'b [f64] {
+        match self {
+            Self::ByOrder { .. } => of_sums,
+            Self::Whole(whole) => &whole.right,
+        }
+    }
+
+    pub(super) fn blocks(&self) -> Vec<Block<'_>> {
+        match self {
+            Self::ByOrder { blocks, .. } => blocks.blocks(),
+            Self::Whole(WholeSums { matrix, sums, .. }) => vec![Block {
+                matrix: Cow::Borrowed(matrix),
+                degrees: degrees(sums.setup.l_max).collect(),
+                places: vec![(0..matrix.nrows()).collect()],
+            }],
+        }
+    }
+}
+
+impl<'a> WholeSums<'a> {
+    /// `None` if no time is left for the matrix.
+    fn new(
+        sums: &'a HarmonicSums,
+        right: &[f64],
+        prior: Option<&[f64]>,
+        watch: NamedWatch<'_>,
+    ) -> Option<Self> {
+        Some(Self::with_matrix(sums, sums.whole_matrix(watch)?, right, prior))
+    }
+
+    pub(super) fn with_matrix(
+        sums: &'a HarmonicSums,
+        matrix: Mat<f64>,
+        right: &[f64],
+        prior: Option<&[f64]>,
+    ) -> Self {
+        let noise = sums.noise_right_hand_side().to_vec();
+        let gain_errors = sums.gain_error_right_hand_sides().to_vec();
+        let exact = Self { sums, matrix, right: right.to_vec(), noise, gain_errors };
+        exact.with_error_as_noise(prior)
+    }
+
+    #[cfg(test)]
+    pub(super) fn matrix(&self) -> &Mat<f64> {
+        &self.matrix
+    }
+
+    /// Counts errors of the matrix as noise.
+    fn with_error_as_noise(self, prior: Option<&[f64]>) -> Self {
+        if self.matrix.llt(Side::Lower).is_ok() {
+            return self;
+        }
+        let Ok(decomposed) = self.matrix.self_adjoint_eigen(Side::Lower) else { return self };
+        let (values, vectors) = (decomposed.S().column_vector(), decomposed.U());
+        let count = values.nrows();
+        let error = -values[0];
+        let modes_of = |v: &[f64]| vectors.transpose() * Mat::from_fn(count, 1, |k, _| v[k]);
+        let sum_of = |modes: &dyn Fn(usize) -> f64| {
+            let sum = vectors * Mat::from_fn(count, 1, |k, _| modes(k));
+            (0..count).map(|k| sum[(k, 0)]).collect::<Vec<f64>>()
+        };
+        let modes = modes_of(&self.right);
+        let mut sky = sum_of(&|k| if values[k] > ACCURATE * error { modes[(k, 0)] / values[k] } else { 0.0 });
+        if let Some(prior) = prior {
+            sky.iter_mut().zip(prior).for_each(|(sky, prior)| *sky += prior);
+        }
+        let norm = sky.iter().map(|x| x * x).sum::<f64>();
+        let noise = error * error * norm / count as f64;
+        let share = |k: usize| if values[k] > 0.0 { values[k] / (values[k] + noise) } else { 0.0 };
+        let scaled = Mat::from_fn(count, count, |i, k| vectors[(i, k)] * share(k) * values[k]);
+        let filtered = |v: &[f64]| {
+            let modes = modes_of(v);
+            sum_of(&|k| share(k) * modes[(k, 0)])
+        };
+        Self {
+            sums: self.sums,
+            matrix: &scaled * vectors.transpose(),
+            right: filtered(&self.right),
+            noise: filtered(&self.noise),
+            gain_errors: self.gain_errors.iter().map(|v| filtered(v)).collect(),
+        }
+    }
+}
+
+impl NormalSums for WholeSums<'_> {
+    fn unknowns(&self) -> usize {
+        self.matrix.nrows()
+    }
+
+    fn apply(&self, x: &[f64], y: &mut [f64]) {
+        for product in self.apply_all(&[x]) {
+            y.copy_from_slice(&product);
+        }
+    }
+
+    fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
+        let columns = Mat::from_fn(self.unknowns(), x.len(), |k, column| x[column][k]);
+        let products = &self.matrix * columns;
+        (0..x.len()).map(|column| (0..self.unknowns()).map(|k| products[(k, column)]).collect()).collect()
+    }
+
+    fn right_hand_side(&self) -> &[f64] {
+        &self.right
+    }
+
+    fn noise_right_hand_side(&self) -> &[f64] {
+        &self.noise
+    }
+
+    fn gain_error_right_hand_sides(&self) -> &[Vec<f64>] {
+        &self.gain_errors
+    }
+
+    fn gain_error_power(&self) -> f64 {
+        self.sums.gain_error_power()
+    }
+
+    fn counts(&self) -> SumCounts {
+        self.sums.counts()
+    }
+
+    fn accuracy(&self) -> Accuracy {
+        self.sums.accuracy()
+    }
+
+    fn failure(&self) -> Option<&str> {
+        self.sums.failure()
+    }
+}
+
+impl HarmonicSums {
+    /// Whether the weights cover enough of the node's turn for the blocks to be near the matrix; `None` of a rank's share, or if the sums could not
+    /// be read.
+    fn is_node_even(&self) -> Option<bool> {
+        (self.grids.share.count == 1).then(|| self.covered_share())?.map(|share| share >= EVEN_SHARE)
+    }
+
+    /// The share of the turn of the node that the weights w cover: `(sum w)^2 / (n sum w^2)` over n nodes.
+    pub(super) fn covered_share(&self) -> Option<f64> {
+        let stride = self.grids.weight_stride();
+        let mut weights = vec![0.0; self.grids.points];
+        for block in 0..self.grids.points.div_ceil(ALPHAS) {
+            let rows = self.tori.block(&self.grids, TorusPart::Weights, block)?;
+            for (k, weight) in weights[block * ALPHAS..].iter_mut().take(ALPHAS).enumerate() {
+                let rows = (0..self.grids.nodes.count).filter_map(|node| rows.row(node, k));
+                *weight = rows.flat_map(|row| &row[..stride]).map(|w| f64::from(*w)).sum();
+            }
+        }
+        let sum: f64 = weights.iter().sum();
+        let squares: f64 = weights.iter().map(|w| w * w).sum();
+        Some(sum * sum / (weights.len() as f64 * squares))
+    }
+
+    /// BtN^-1B over all unknowns; `None` if no time is left for it.
+    fn whole_matrix(&self, watch: NamedWatch<'_>) -> Option<Mat<f64>> {
+        let count = self.unknowns();
+        let task = watch.start("matrix, by columns", 0.0);
+        let mut matrix = Mat::zeros(count, count);
+        for first in (0..count).step_by(COLUMNS) {
+            if !task.report_step(true, first, (count - first) as f64 / count as f64) {
+                return None;
+            }
+            let unit = |column: usize| {
+                let mut unit = vec![0.0; count];
+                unit[column] = 1.0;
+                unit
+            };
+            let units: Vec<Vec<f64>> = (first..count.min(first + COLUMNS)).map(unit).collect();
+            let units: Vec<&[f64]> = units.iter().map(Vec::as_slice).collect();
+            for (column, product) in (first..).zip(self.apply_all(&units)) {
+                // Half to each side, as products are not symmetric to the last bit.
+                for (row, value) in product.iter().enumerate() {
+                    matrix[(row, column)] += 0.5 * value;
+                    matrix[(column, row)] += 0.5 * value;
+                }
+            }
+        }
+        Some(matrix)
+    }
+}
