@@ -144,16 +144,14 @@ impl Plan {
         let sent: f64 = expected.iter().map(|e| e.sent).sum();
         let solutions = self.solutions(sent);
         let (windows, limb_range_rad) = (self.windows.len() as f64, self.limb_range_rad());
-        let planes = windows.min(WINDOWS_COVERED * self.node_turns());
         let error_draws = self.config.calibration.known_error_draws();
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
             let is_mapped = map.is_mapped(ChannelId(channel as u16));
-            let visibilities = expected.mapped;
             let data = ChannelData {
                 frequency_hz,
-                visibilities,
+                visibilities: expected.mapped,
                 windows,
-                planes,
+                planes: windows.min(WINDOWS_COVERED * self.node_turns()),
                 every_nth: self.schedules[channel].every_nth as f64,
                 solutions,
                 limb_range_rad,
