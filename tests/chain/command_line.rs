@@ -479,6 +479,26 @@ fn what_would_fail_at_the_last_step_fails_in_check() {
 }
 
 #[test]
+fn check_and_run_agree_on_channels_without_a_baseline() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = write(folder.path(), "small.toml", common::workplace::SMALL);
+    let out = folder.path().join("out");
+    // The shortest baseline is some 100 m: 10 wavelengths at 30 MHz.
+    let limit = ["--set", "spacecraft.baseline_wavelengths_max=8", "--set"];
+    for (channels, is_good) in
+        [("spacecraft.channels_hz=[3e6, 30e6]", true), ("spacecraft.channels_hz=[30e6]", false)]
+    {
+        for command in [&["check", &small][..], &["run", &small, "--out", out.to_str().unwrap()]] {
+            let output = lunarray().args([command, &limit, &[channels]].concat()).output().unwrap();
+            let said = String::from_utf8(output.stderr).unwrap();
+            assert_eq!(output.status.success(), is_good, "{command:?} {channels}: {said}");
+            let named = "no map of 30.000 MHz (spacecraft.baseline_wavelengths_max)";
+            assert!(said.contains(named), "{command:?} {channels}: {said}");
+        }
+    }
+}
+
+#[test]
 fn a_sky_too_coarse_for_its_baselines_is_said() {
     let folder = tempfile::tempdir().unwrap();
     let small = write(folder.path(), "small.toml", common::workplace::SMALL);

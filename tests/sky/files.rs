@@ -8,9 +8,11 @@ use std::path::Path;
 
 use lunarray::sky::fits::{
     Card, CardValue, Column, FitsError, FitsProblem, MapFile, MapOutline, Ordering, Precision, ReadOptions,
-    SkyChannel, WriteOptions, check_frequency, read_known_sky, read_map, read_map_file, read_map_from,
-    read_notes, read_prior, read_sky, read_whole_map, sky_notes, write_columns, write_map,
+    SkyChannel, WriteOptions, check_frequency, image_bytes, read_known_sky, read_map, read_map_file,
+    read_map_from, read_notes, read_prior, read_sky, read_whole_map, sky_notes, write_alm, write_columns,
+    write_map,
 };
+use lunarray::sky::harmonics::AnalysisOptions;
 use lunarray::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
 use proptest::prelude::*;
@@ -106,6 +108,34 @@ fn several_columns_and_provenance_are_kept() {
     assert!(second.header.cards().windows(cards.len()).any(|some| some == cards));
     let third = read_map(&path, &ReadOptions { column: Some(2), ..ReadOptions::default() });
     assert!(matches!(*third.unwrap_err().problem, FitsProblem::NoColumn { column: 2, columns: 2 }));
+}
+
+#[test]
+fn every_file_names_its_program_once_and_no_date() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("alm.fits");
+    let sky = map(4);
+    write_alm(&path, &sky.harmonics(3, &AnalysisOptions::default()).unwrap(), &[]).unwrap();
+    let cards = |name: &str| WriteOptions {
+        cards: vec![Card::text("CREATOR", name, "another program")],
+        ..WriteOptions::default()
+    };
+    let own = concat!("CREATOR = 'lunarray ", env!("CARGO_PKG_VERSION"), "'");
+    for (bytes, expected) in [
+        (bytes_of(&sky, &WriteOptions::default()), own),
+        (fs::read(&path).unwrap(), own),
+        (image_bytes(2, &[1.0, 2.0], &[]).unwrap(), own),
+        (bytes_of(&sky, &cards("other")), "CREATOR = 'other   '"),
+    ] {
+        let with = |key: &str| -> Vec<String> {
+            let cards = bytes.as_chunks::<80>().0.iter().filter(|card| card.starts_with(key.as_bytes()));
+            cards.map(|card| String::from_utf8_lossy(card).into_owned()).collect()
+        };
+        let found = with("CREATOR ");
+        assert!(found.len() == 1 && found[0].starts_with(expected), "{found:?}");
+        // The time of writing would change the bytes of equal maps.
+        assert_eq!(with("DATE "), Vec::<String>::new());
+    }
 }
 
 #[test]

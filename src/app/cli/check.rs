@@ -98,7 +98,8 @@ fn checked(args: &CheckArgs) -> Result<(Plan, Cost), CommandError> {
     print_notes(sky_notes(&plan)?);
     let cost = plan.cost_with_ranks(ranks).on_nodes(args.pipeline.memory_limit());
     cost.require_finite()?;
-    print_notes(plan.baseline_note(&cost, Segment::Whole));
+    plan.require_baseline(&cost)?;
+    print_notes(plan.baseline_note(&cost, Segment::Whole).into_iter().chain(plan.unmapped_note(&cost)));
     Ok((plan, cost))
 }
 

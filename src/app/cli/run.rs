@@ -74,7 +74,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     let out = args.out.clone().map_or_else(|| default_out(&plan.config.name), Ok)?;
     let cost = plan.cost_with_ranks(job.ranks().share().count);
     if job.is_first() {
-        print_notes(plan.baseline_note(&cost, Segment::Whole));
+        print_notes(plan.baseline_note(&cost, Segment::Whole).into_iter().chain(plan.unmapped_note(&cost)));
     }
     if let Some(size) = args.groups {
         return in_groups(args, &plan, size, &out);

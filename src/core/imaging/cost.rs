@@ -7,7 +7,7 @@ use crate::imaging::{MapConfig, RegulariserChoice};
 pub(in crate::imaging) const ITERATIONS: f64 = 11.0;
 
 /// Number of windows below which iterations grow, and the power of the fraction by which they do: 24 with 50 windows, 75 to 183 with 17.
-const WINDOWS_COVERED: f64 = 90.0;
+pub const WINDOWS_COVERED: f64 = 90.0;
 const COVERAGE_EXPONENT: f64 = 1.4;
 
 /// Maximum number of iterations of a solution from few windows, which determine few harmonics.
@@ -52,6 +52,10 @@ pub struct ChannelData {
     pub visibilities: f64,
     /// Number of observation windows.
     pub windows: f64,
+    /// Number of them in planes of their own: at most what the turn of the node has.
+    pub planes: f64,
+    /// Every so many integrations are sent.
+    pub every_nth: f64,
     /// Number of maps: intermediate ones and the final one.
     pub solutions: u64,
     /// Range of the angle between nadir and limb over the mission, rad.
@@ -86,6 +90,8 @@ mod tests {
         frequency_hz: 1e7,
         visibilities: 25_000.0,
         windows: 200.0,
+        planes: 200.0,
+        every_nth: 1.0,
         solutions: 1,
         limb_range_rad: 0.05,
         error_draws: 0,

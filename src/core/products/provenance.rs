@@ -27,7 +27,6 @@ impl Provenance {
             solution.instrument.as_ref();
         let frequency_hz = channels.get(usize::from(solution.channel.0)).map_or(0.0, |c| c.frequency_hz);
         let mut cards = vec![
-            Card::text("CREATOR", concat!("lunarray ", env!("CARGO_PKG_VERSION")), "program"),
             Card::text(
                 "PIPELINE",
                 &in_ascii(&name.chars().take(60).collect::<String>()),

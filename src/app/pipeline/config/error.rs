@@ -306,6 +306,9 @@ pub enum PipelineError {
     /// A spool file cannot be written or read back.
     #[error(transparent)]
     Spool(#[from] crate::mother::SpoolError),
+    /// No baseline for any map.
+    #[error("{0}")]
+    NoBaseline(String),
     /// An estimate of the cost that is not finite.
     #[error(
         "the estimated {what} is {value}: nothing bounds this run; expected settings of which the work can be estimated: look for periods, \

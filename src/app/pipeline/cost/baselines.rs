@@ -1,8 +1,8 @@
-//! Note on a long simulation of baselines that no map uses.
+//! Notes on baselines: a long simulation of those that no map uses, and channels that have none for their map.
 
-use super::estimate::{Cost, Segment};
+use super::estimate::{ChannelCost, Cost, Segment};
 use crate::mother::Fidelity;
-use crate::pipeline::config::Plan;
+use crate::pipeline::config::{PipelineError, Plan};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, PerChannel};
 
@@ -56,6 +56,53 @@ impl Plan {
     }
 }
 
+impl Plan {
+    /// A note if some channels to map have no baseline within their limits in the middle of any window, so that a run makes no map of them.
+    /// `cost` is that of this plan.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn unmapped_note(&self, cost: &Cost) -> Option<String> {
+        let name = |channel: &ChannelCost| {
+            let key = match channel.visibilities_sent > 0.0 {
+                true => "map.baseline_bp_max",
+                false => "spacecraft.baseline_wavelengths_max",
+            };
+            format!("{:.3} MHz ({key})", channel.frequency_hz / 1e6)
+        };
+        let unmapped: Vec<String> =
+            self.to_map(cost).filter(|channel| is_unmapped(channel)).map(name).collect();
+        (!unmapped.is_empty()).then(|| {
+            format!(
+                "no map of {}: in the middle of no observing window is a baseline below the limit; expected a larger limit, or satellites \
+                 closer together",
+                unmapped.join(", ")
+            )
+        })
+    }
+
+    /// Requires a baseline within its limits for at least one channel to map; a run without it ends without a map, which is an error.
+    ///
+    /// # Errors
+    /// [`PipelineError::NoBaseline`].
+    #[doc(hidden)]
+    pub fn require_baseline(&self, cost: &Cost) -> Result<(), PipelineError> {
+        let is_without = self.to_map(cost).all(is_unmapped);
+        self.unmapped_note(cost)
+            .filter(|_| is_without)
+            .map_or(Ok(()), |note| Err(PipelineError::NoBaseline(note)))
+    }
+
+    /// Costs of the channels to map.
+    fn to_map<'a>(&'a self, cost: &'a Cost) -> impl Iterator<Item = &'a ChannelCost> {
+        let numbered = (0..).map(ChannelId).zip(&cost.channels);
+        numbered.filter(|(channel, _)| self.config.map.is_mapped(*channel)).map(|(_, cost)| cost)
+    }
+}
+
+fn is_unmapped(channel: &ChannelCost) -> bool {
+    channel.visibilities_mapped == 0.0
+}
+
 impl Cost {
     /// Estimated time of a segment, s.
     fn segment_s(&self, segment: Segment) -> f64 {
@@ -81,6 +128,11 @@ mod tests {
     use super::*;
     use crate::pipeline::config::ConfigSource;
 
+    fn plan(sets: &[&str]) -> Plan {
+        let overrides = sets.iter().map(|set| (*set).to_owned()).collect();
+        Plan::new(ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap()).unwrap()
+    }
+
     fn note(more: &[&str], segment: Segment) -> Option<String> {
         let sets = [
             "spacecraft.channels_hz=[3e6]",
@@ -89,8 +141,7 @@ mod tests {
             "spacecraft.baseline_wavelengths_max=0",
             "map.nside=16",
         ];
-        let overrides = sets.iter().chain(more).map(|set| (*set).to_owned()).collect();
-        let plan = Plan::new(ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap()).unwrap();
+        let plan = plan(&[&sets[..], more].concat());
         plan.baseline_note(&plan.cost(), segment)
     }
 
@@ -115,6 +166,32 @@ mod tests {
             "spacecraft.thin=100000",
         ] {
             assert_eq!(note(&[more], Segment::Whole), None, "{more}");
+        }
+    }
+
+    #[test]
+    fn channels_without_a_baseline_are_named_and_fail_if_there_are_no_others() {
+        // The shortest baseline is some 100 m (paper): 10 wavelengths at 30 MHz, and one at 3 MHz. A map's limit of 2 b_p at nside 4 is 7.8.
+        for (sets, key) in [
+            (
+                ["map.nside=16", "spacecraft.baseline_wavelengths_max=8"],
+                "spacecraft.baseline_wavelengths_max",
+            ),
+            (["map.nside=4", "spacecraft.baseline_wavelengths_max=31.3"], "map.baseline_bp_max"),
+        ] {
+            let found = |channels: &str| {
+                let channels = format!("spacecraft.channels_hz={channels}");
+                let plan = plan(&[&sets[..], &[&channels]].concat());
+                let cost = plan.cost();
+                (plan.unmapped_note(&cost), plan.require_baseline(&cost).is_ok())
+            };
+            let note = format!("no map of 30.000 MHz ({key}): ");
+            for (channels, is_good) in [("[3e6, 30e6]", true), ("[30e6]", false)] {
+                let (said, is_accepted) = found(channels);
+                assert!(said.as_ref().is_some_and(|said| said.starts_with(&note)), "{said:?}");
+                assert_eq!(is_accepted, is_good, "{channels}");
+            }
+            assert_eq!(found("[3e6]"), (None, true));
         }
     }
 }

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::rates::{FRINGES_PER_S, SAMPLES_PER_S};
 use crate::frames::ObservingWindow;
-use crate::imaging::cost::{ChannelData, EngineCost};
+use crate::imaging::cost::{ChannelData, EngineCost, WINDOWS_COVERED};
 use crate::imaging::rates::{AVERAGE_INSTANTS, cores};
 use crate::mother::{Fidelity, VISIBILITY_BYTES};
 use crate::pipeline::config::{Expected, MemoryLimit, PipelineError, Plan};
@@ -147,9 +147,16 @@ impl Plan {
         let error_draws = self.config.calibration.known_error_draws();
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
             let is_mapped = map.is_mapped(ChannelId(channel as u16));
-            let visibilities = expected.mapped;
-            let data =
-                ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad, error_draws };
+            let data = ChannelData {
+                frequency_hz,
+                visibilities: expected.mapped,
+                windows,
+                planes: windows.min(WINDOWS_COVERED * self.node_turns()),
+                every_nth: self.schedules[channel].every_nth as f64,
+                solutions,
+                limb_range_rad,
+                error_draws,
+            };
             if is_mapped { map.cost(data).with_ranks(ranks, map) } else { EngineCost::default() }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
@@ -213,6 +220,13 @@ impl Plan {
     /// Number of skies that are generated, not read.
     fn generated_skies(&self) -> usize {
         if self.config.sky.file.is_none() { self.config.spacecraft.channels_hz.len() } else { 0 }
+    }
+
+    /// Turns of the formation's node in the mission; infinite without a formation.
+    fn node_turns(&self) -> f64 {
+        let array = &self.config.array;
+        let turns = self.config.spacecraft.duration_s / array.precession_period_s;
+        if array.has_own_orbits() { f64::INFINITY } else { turns }
     }
 
     /// Range of the angle between nadir and limb of daughter 1 in the observing windows, rad.
@@ -435,5 +449,38 @@ impl fmt::Display for Cost {
             self.predicted_s,
             cores()
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::config::ConfigSource;
+
+    const FREE: [&str; 2] = ["map.engine=pixel", "map.matrix=free"];
+    const REFINED: [&str; 3] = ["map.engine=harmonic", "map.refine.passes_max=3", "array.eccentricity=0.01"];
+    const MONTH: [&str; 2] = ["spacecraft.duration_s=30d", "spacecraft.every_nth_window=10"];
+    const FEW: [&str; 1] = ["spacecraft.every_nth_window=300"];
+
+    /// Processor times of the stage `solve` of the quicklook at 3 MHz and nside 8, of a virtual machine with two cores of an Intel Xeon with AVX-512
+    /// beside other work, 28 November 2026.
+    #[test]
+    fn maps_take_the_time_that_was_measured() {
+        for (sets, measured_s) in [
+            (&[&REFINED[..], &MONTH].concat(), 21.5),
+            (&REFINED.to_vec(), 3.1),
+            (&[&FREE[..], &MONTH].concat(), 121.0),
+            (&[&FREE[..], &FEW].concat(), 26.4),
+            (&[&FREE[..], &FEW, &["map.epsilon=1e-4"]].concat(), 19.7),
+        ] {
+            let common = ["spacecraft.channels_hz=[3e6]", "map.nside=8", "map.snapshot_every_s=0"];
+            let overrides = common.iter().chain(sets).map(|set| (*set).to_owned()).collect();
+            let config = ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap();
+            let cost = Plan::new(config).unwrap().cost();
+            let estimated_s = cores() * cost.channels[0].mapping_s;
+            // Other work on the machine changes processor times by about this.
+            let ratio = estimated_s / measured_s;
+            assert!((1.0 / 1.5..1.5).contains(&ratio), "{sets:?}: {estimated_s} s, {measured_s} s measured");
+        }
     }
 }

@@ -150,8 +150,17 @@ pub(in crate::pipeline) fn complete_costs(
     let channels = (0..).map(ChannelId).zip(&instrument.channels);
     let cost = |frequency_hz: f64| {
         let (visibilities, solutions) = (map.refine.visibilities_max as f64, memory_solutions(map));
-        let (windows, limb_range_rad) = (f64::INFINITY, f64::INFINITY);
-        map.cost(ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad, error_draws })
+        let unlimited = f64::INFINITY;
+        map.cost(ChannelData {
+            frequency_hz,
+            visibilities,
+            windows: unlimited,
+            planes: unlimited,
+            every_nth: 1.0,
+            solutions,
+            limb_range_rad: unlimited,
+            error_draws,
+        })
     };
     channels
         .filter(|(channel, _)| map.is_mapped(*channel))

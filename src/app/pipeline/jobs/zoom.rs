@@ -211,7 +211,6 @@ fn post(ledger: &Ledger<VisibilityReason>, counts: AveragingCounts) {
 /// Cards of the origin of the data.
 fn cards(instrument: &Instrument, counts: AveragingCounts) -> Vec<Card> {
     vec![
-        Card::text("CREATOR", concat!("lunarray ", env!("CARGO_PKG_VERSION")), "program"),
         Card::text("TELESCOP", "lunarray", "array of satellites in lunar orbit"),
         Card::integer("NVIS", counts.averaged.try_into().unwrap_or(i64::MAX), "visibilities used"),
         Card::text("SEED", &format!("{:016x}", instrument.seed), "seed of the space segment, hexadecimal"),

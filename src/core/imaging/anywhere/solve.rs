@@ -51,7 +51,7 @@ const DIRECT_UNKNOWNS_MAX: usize = 41 * 41;
 const DIRECT_PRODUCTS_MAX: usize = 50_000_000;
 
 /// Columns of the matrix that are formed together, so that rows of B are computed once for all of them.
-const COLUMNS_AT_ONCE: usize = 16;
+pub(super) const COLUMNS_AT_ONCE: usize = 16;
 
 /// Stopping rule of a refinement.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -333,8 +333,7 @@ impl RefinedProblem<'_> {
     }
 
     fn can_be_formed(&self) -> bool {
-        let (unknowns, rows) = (self.sums.circle.unknowns(), self.sums.plan.computed());
-        unknowns <= DIRECT_UNKNOWNS_MAX && rows.saturating_mul(unknowns) <= DIRECT_PRODUCTS_MAX
+        can_be_formed(self.sums.circle.unknowns(), self.sums.plan.computed())
     }
 
     /// Forms the matrix and solves by Cholesky factorisation; `None` if it is interrupted.
@@ -368,6 +367,11 @@ impl RefinedProblem<'_> {
             Column { x, residual }
         }))
     }
+}
+
+/// Whether the true matrix of so many unknowns is formed from so many rows where a refinement converges slowly.
+pub(super) fn can_be_formed(unknowns: usize, rows: usize) -> bool {
+    unknowns <= DIRECT_UNKNOWNS_MAX && rows.saturating_mul(unknowns) <= DIRECT_PRODUCTS_MAX
 }
 
 /// The relative residual `sqrt(r.Mr / b.Mb)`, with `z = M r` and `right_norm = b.Mb`; 0 without data.

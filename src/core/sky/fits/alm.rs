@@ -6,7 +6,7 @@ use std::path::Path;
 use super::card::Card;
 use super::error::{FitsError, FitsProblem};
 use super::header::BLOCK_BYTES;
-use super::write::{binary_table_cards, end_header, primary_cards, write_whole};
+use super::write::{binary_table_cards, table_header, write_whole};
 use crate::sky::harmonics::Alm;
 
 /// Length of a row, bytes: an index of 32 bits and two doubles.
@@ -18,15 +18,7 @@ const ROW_BYTES: usize = 20;
 /// [`FitsError`]: cards that FITS cannot represent, or an error of the operating system.
 pub fn write_alm(path: &Path, alm: &Alm, cards: &[Card]) -> Result<(), FitsError> {
     let write = || {
-        let mut header = Vec::new();
-        for card in primary_cards() {
-            card.write_to(&mut header)?;
-        }
-        end_header(&mut header);
-        for card in structure(alm).iter().chain(cards) {
-            card.write_to(&mut header)?;
-        }
-        end_header(&mut header);
+        let header = table_header(&structure(alm), cards)?;
         write_whole(path, |out| {
             out.write_all(&header).map_err(FitsProblem::io("write"))?;
             out.write_all(&rows(alm)).map_err(FitsProblem::io("write"))

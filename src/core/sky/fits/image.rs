@@ -5,7 +5,7 @@ use std::path::Path;
 use super::card::Card;
 use super::error::{FitsError, FitsProblem};
 use super::header::BLOCK_BYTES;
-use super::write::end_header;
+use super::write::append_header;
 
 /// Creates in memory a file with an image of `width` columns in single precision. `rows` are from top to bottom, and FITS stores
 /// them from bottom to top; NaN means no value.
@@ -26,10 +26,7 @@ pub fn image_bytes(width: usize, rows: &[f32], cards: &[Card]) -> Result<Vec<u8>
             Card::integer("NAXIS2", (rows.len() / width) as i64, "length of dimension 2"),
         ];
         let mut bytes = Vec::with_capacity(4 * rows.len() + 2 * BLOCK_BYTES);
-        for card in structure.iter().chain(cards) {
-            card.write_to(&mut bytes)?;
-        }
-        end_header(&mut bytes);
+        append_header(&mut bytes, &structure, cards)?;
         for row in rows.chunks_exact(width).rev() {
             bytes.extend(row.iter().flat_map(|value| value.to_be_bytes()));
         }

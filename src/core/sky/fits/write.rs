@@ -194,19 +194,9 @@ impl<'a> Table<'a> {
     }
 
     fn header(&self, frame: Frame) -> Result<Vec<u8>, FitsProblem> {
-        let mut header = Vec::new();
-        for card in primary_cards() {
-            card.write_to(&mut header)?;
-        }
-        end_header(&mut header);
-        for card in self.structure_cards().into_iter().chain(self.map_cards(frame)) {
-            card.write_to(&mut header)?;
-        }
-        for card in &self.options.cards {
-            card.write_to(&mut header)?;
-        }
-        end_header(&mut header);
-        Ok(header)
+        let mut cards = self.structure_cards();
+        cards.extend(self.map_cards(frame));
+        table_header(&cards, &self.options.cards)
     }
 
     fn structure_cards(&self) -> Vec<Card> {
@@ -284,16 +274,39 @@ impl<'a> Table<'a> {
     }
 }
 
-pub(super) fn primary_cards() -> [Card; 4] {
-    [
+/// An empty primary part, and the header of a table, which ends with the caller's cards.
+pub(super) fn table_header(structure: &[Card], given: &[Card]) -> Result<Vec<u8>, FitsProblem> {
+    let mut header = Vec::new();
+    for card in [
         Card::logical("SIMPLE", true, "conforms to FITS standard"),
         Card::integer("BITPIX", 8, "array data type"),
         Card::integer("NAXIS", 0, "number of array dimensions"),
         Card::logical("EXTEND", true, ""),
-    ]
+    ] {
+        card.write_to(&mut header)?;
+    }
+    end_header(&mut header);
+    append_header(&mut header, structure, given)?;
+    Ok(header)
 }
 
-pub(super) fn end_header(header: &mut Vec<u8>) {
+/// Appends a header that ends with the caller's cards, after the program that writes it unless they name one. It has no DATE, so that equal data
+/// give equal bytes.
+pub(super) fn append_header(
+    header: &mut Vec<u8>,
+    structure: &[Card],
+    given: &[Card],
+) -> Result<(), FitsProblem> {
+    let creator = Card::text("CREATOR", concat!("lunarray ", env!("CARGO_PKG_VERSION")), "program");
+    let creator = (!given.iter().any(|card| card.key == creator.key)).then_some(creator);
+    for card in structure.iter().chain(&creator).chain(given) {
+        card.write_to(header)?;
+    }
+    end_header(header);
+    Ok(())
+}
+
+fn end_header(header: &mut Vec<u8>) {
     header.extend_from_slice(b"END");
     header.resize(header.len().next_multiple_of(BLOCK_BYTES), b' ');
 }
