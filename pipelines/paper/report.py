@@ -18,6 +18,7 @@ import json
 import math
 import re
 import resource
+import shutil
 import subprocess
 import time
 from pathlib import Path
@@ -134,7 +135,7 @@ def uvw(n):
             ["greatest abs(w) / b", f"{n['w_share_max']:.4f}", "sin 30 deg = 0.5"],
             ["mean of (w / b)^2", f"{n['w_share_square_mean']:.4f}", "sin^2 30 deg / 2 = 0.125"],
             ["filled share of the plane u, v", f"{n['filled'][0]:.3f}", "1"],
-            ["of u, w and v, w", f"{n['filled'][1]:.3f}, {n['filled'][2]:.3f}", "-"],
+            ["of u, w and v, w", f"{n['filled'][1]:.3f}, {n['filled'][2]:.3f}", "0.609"],
         ],
     )
 
@@ -146,9 +147,9 @@ def coverage():
          f"{band['shortest_wavelengths']:.2f}", f"{band['uv_filled']:.2f}"]
         for band in n["channels"][0]["bands"]
     ]
-    head = ["degrees from the ecliptic", "pair hours at 10 MHz", "shortest projected, wavelengths", "uv filled"]
+    head = ["degrees from the ecliptic", "pair hours at 10 MHz", "shortest projected, wavelengths", "share of uv cells filled"]
     least, mean, most = (1 / share for share in reversed(n["first_over_channel"][1]))
-    return table(head, rows) + f"\nHours at 3 MHz over those at 10: {mean:.2f} ({least:.2f} to {most:.2f}).\n"
+    return table(head, rows) + f"\nMeans over directions. Hours at 3 MHz over those at 10: {mean:.2f} ({least:.2f} to {most:.2f}).\n"
 
 
 def beam_row(n):
@@ -227,7 +228,10 @@ def patches():
         folder = case_of(mhz, SMOOTHED[mhz]) / f"{mhz:.3f}MHz"
         clean, noise = (healpy.read_map(folder / f"{name}-smooth.fits", dtype=float) for name in ("map", "noise"))
         healpy.write_map(folder / "with-noise.fits", clean + noise, dtype=float, coord="E", column_units="K", overwrite=True)
-        panels = [folder / name for name in ("input-smooth.fits", "map-smooth.fits", "with-noise.fits")]
+        # Panels are titled with the names of their files.
+        panels = [OUT / name for name in ("input", "map without noise", "map with noise")]
+        for panel, name in zip(panels, ("input-smooth", "map-smooth", "with-noise")):
+            shutil.copy(folder / f"{name}.fits", panel)
         strips = []
         for k, centre in enumerate(PATCHES):
             out = OUT / f"patch-{mhz:g}-{k + 1}.png"
@@ -461,8 +465,9 @@ def sheets(ulsa):
         ("Fig. 1: a patch, and N(>S)",
          {f"sources-{mhz}mhz.csv": sky(mhz, 256, f" --out out/sky-{mhz}mhz.fits --sources out/sources-{mhz}mhz.csv") for mhz in (3, 10, 30)}
          | {"diffuse/summary.json": diffuse,
-            "diffuse-10mhz.fits": "cp out/diffuse/10.000MHz/input-smooth.fits out/diffuse-10mhz.fits",
-            "patch.png": "lunarray cutout out/diffuse-10mhz.fits --frame ecliptic --centre 120,0 --out out/patch.png"}, counts),
+            # The title of a cutout is the name of its file.
+            "diffuse sky at 10 MHz": "cp out/diffuse/10.000MHz/input-smooth.fits 'out/diffuse sky at 10 MHz'",
+            "patch.png": "lunarray cutout 'out/diffuse sky at 10 MHz' --frame ecliptic --centre 120,0 --out out/patch.png"}, counts),
         ("Fig. 2: the full sky", full_sky_run, full_sky),
         ("Fig. 3: q0 against R and R_2", drawn("spacing"), lambda: figure("spacing", spacing)),
         ("Fig. 4: time by baseline length", drawn("pair-time"), lambda: figure("pair-time", pair_time)),

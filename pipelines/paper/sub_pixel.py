@@ -5,8 +5,9 @@
     python3 pipelines/paper/sub_pixel.py map 8 SKY.fits [BASELINES]
 
 report.py makes the sky. Delta b is a fringe over pixels of nside 128 less the model's row, by pixel centres and averaged; C_l is the sky's
-own. `matrix` takes 800 instants of one window of the pair whose length is nearest b_p there, and draws the matrices on one scale as out/sub-pixel-matrix.png; `map` takes
-random instants of all pairs with b < 2 b_p, and R = 1e-4 W_max I. Beside the formulas stand the residuals V - B T of the sky itself.
+own. `matrix` takes 800 instants of one window of the pair whose length is nearest b_p there, and draws the matrices, each on its own scale,
+as out/sub-pixel-matrix.png; `map` takes random instants of all pairs with b < 2 b_p, and R = 1e-4 W_max I. Beside the formulas stand the
+residuals V - B T of the sky itself.
 """
 
 import struct
@@ -113,7 +114,9 @@ def matrix(sky):
         amplitudes = [np.sqrt(x / power) for x in (diagonal.mean(), (found**2).mean())]
         print(f"| {name} | {amplitudes[0]:.3f} | {amplitudes[1]:.3f} | {text[0]} | {text[1]} | {np.abs(np.tril(correlation, -1)).sum() / (INSTANTS * (2 * INSTANTS - 1)):.3f} |")
         panels.append(n_b.reshape(400, 4, 400, 4).mean((1, 3)))
-    write_png("out/sub-pixel-matrix.png", np.hstack([panels[0], np.zeros((400, 8)), panels[1]]) / np.abs(panels[0]).max())
+    # Each on its own scale: averaged rows err too little to be seen on that of centres.
+    panels = [panel / np.abs(panel).max() for panel in panels]
+    write_png("out/sub-pixel-matrix.png", np.hstack([panels[0], np.zeros((400, 8)), panels[1]]))
 
 
 def error_map(sky, wanted):
