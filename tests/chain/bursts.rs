@@ -296,6 +296,56 @@ fn two_sessions_of_a_pass_find_its_burst_once_and_give_its_packets_back() {
     assert!(alike[0] > 0.98 && alike[1] < 0.9, "{alike:?}");
 }
 
+/// Three bursts of two channels while the Sun is in sight; those at 12 MHz are 1.44 times fainter and shorter, and come earlier.
+const BURSTS: &str = "sky.moving=[{ direction = 'sun', starts_s = [37_300.0, 38_000.0, 38_700.0], peak_jy = 1e8, spectral_index = -2.0 }]";
+
+#[test]
+fn light_curves_are_those_of_the_truth_within_their_errors() {
+    let place = Workplace::new(&MISSION.replace("channels_hz = [10.0e6]", "channels_hz = [10.0e6, 12.0e6]"));
+    let file = place.simulate("bursts.ccsds", &["--set", BURSTS]);
+    let out = place.path("light-curves");
+    let report = json(&["bursts", &file, "--out", &out]);
+    assert_eq!(report["events"].as_array().unwrap().len(), 3, "{report}");
+    let text = |path: &str| std::fs::read_to_string(path).unwrap();
+    let lines = |text: &str| -> Vec<Vec<f64>> {
+        let line = |line: &str| line.split(',').map(|field| field.parse().unwrap_or(f64::NAN)).collect();
+        text.lines().skip(1).map(line).collect()
+    };
+    // Of the truth: channel, start, peak, decay and flux density at the peak of each burst.
+    let truth = lines(&text(&format!("{file}.moving.csv")));
+    assert_eq!(truth.len(), 6);
+    // Integral of a linear rise and an exponential decay, until a time.
+    let until = |burst: &[f64], t_s: f64| {
+        let [start_s, peak_s, decay_s, peak_jy] = [burst[3], burst[4], burst[5], burst[6]];
+        let (risen, fallen) = ((t_s - start_s).clamp(0.0, peak_s - start_s), (t_s - peak_s).max(0.0));
+        peak_jy * (0.5 * risen * risen / (peak_s - start_s) + decay_s * (1.0 - (-fallen / decay_s).exp()))
+    };
+    let (mut values, mut within, mut bright) = (0, [0; 2], 0);
+    for number in 1..=3 {
+        let path = format!("{out}/event-{number:04}");
+        for value in lines(&text(&format!("{path}.csv"))) {
+            let [channel, from_s, until_s, flux_jy, error_jy] = [0, 3, 4, 5, 6].map(|column| value[column]);
+            let of_channel = truth.iter().filter(|burst| burst[1] == channel);
+            let total = of_channel.map(|burst| until(burst, until_s) - until(burst, from_s)).sum::<f64>();
+            let true_jy = total / (until_s - from_s);
+            let sigma = (flux_jy - true_jy).abs() / error_jy;
+            values += 1;
+            [1.0, 1.96].into_iter().zip(&mut within).for_each(|(limit, n)| *n += i32::from(sigma < limit));
+            bright += i32::from(true_jy > 1e7);
+            // A bright value is known to a tenth: five pairs of the daughters would do.
+            assert!(true_jy < 1e7 || error_jy < 0.1 * true_jy, "{value:?} {true_jy}");
+        }
+        assert!(std::fs::read(format!("{path}.png")).unwrap().starts_with(b"\x89PNG"));
+    }
+    // As in the unit tests, three standard deviations of a quarter of the values as if independent; errors here may be a third too large.
+    let share = |n: i32| f64::from(n) / f64::from(values);
+    assert!(values > 60 && bright > 12, "{values} {bright}");
+    assert!(share(within[0]) > 0.6 && share(within[1]) > 0.88, "{within:?} of {values}");
+    // What is read once is counted once, and a state's archive has the same packets.
+    let ledger = &report["ledger"];
+    assert_eq!(ledger["accumulated"], ledger["sampled"], "{ledger}");
+}
+
 #[test]
 fn bursts_are_not_looked_for_unless_asked() {
     let place = Workplace::new(MISSION);
