@@ -15,7 +15,8 @@ use crate::pipeline::{BurstsReport, bursts_of_downlink, use_threads};
 /// that overlap in time in any channels are one event. In all channels the flux density from its direction is fitted by time, each value with its
 /// standard error.
 ///
-/// Leaves event-N.csv (light curves of all channels), event-N.png (dynamic spectrum) and summary.json in the output folder.
+/// Leaves event-N.csv (light curves of all channels), event-N.png (dynamic spectrum; grey where no value is above its error) and summary.json
+/// in the output folder.
 ///
 /// Example: lunarray bursts pass-*.ccsds --out bursts/
 #[derive(Debug, Args)]
