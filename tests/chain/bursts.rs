@@ -296,6 +296,59 @@ fn two_sessions_of_a_pass_find_its_burst_once_and_give_its_packets_back() {
     assert!(alike[0] > 0.98 && alike[1] < 0.9, "{alike:?}");
 }
 
+/// Two bursts while the Sun is in sight; at 12 MHz they are 1.44 times fainter and shorter, and come earlier.
+const BURSTS: &str = "sky.moving=[{ direction = 'sun', starts_s = [37_300.0, 38_000.0], peak_jy = 1e8, spectral_index = -2.0 }]";
+
+/// The rows of a table (CSV); NaN for text.
+fn table(path: &str) -> Vec<Vec<f64>> {
+    let text = std::fs::read_to_string(path).unwrap();
+    let row = |line: &str| line.split(',').map(|field| field.parse().unwrap_or(f64::NAN)).collect();
+    text.lines().skip(1).map(row).collect()
+}
+
+#[test]
+fn light_curves_are_those_of_the_truth_within_their_errors() {
+    // Integrations of some seconds, shorter than the bursts.
+    let mission = MISSION.replace("channels_hz = [10.0e6]", "channels_hz = [10.0e6, 12.0e6]");
+    let mission = mission.replace("every_nth_window = 2", "every_nth_window = 4");
+    let arcs = "[100.0, 250.0, 500.0, 900.0, 1500.0, 2300.0, 3300.0]";
+    let place = Workplace::new(&mission.replace("[15.0, 32.0, 52.0, 80.0, 120.0, 170.0, 240.0]", arcs));
+    let file = place.simulate("bursts.ccsds", &["--set", BURSTS]);
+    let out = place.path("light-curves");
+    let report = json(&["bursts", &file, "--out", &out]);
+    let found: Vec<usize> =
+        report["events"].as_array().unwrap().iter().map(|e| e["bursts"].as_array().unwrap().len()).collect();
+    assert_eq!(found, [2, 2], "{report}");
+    // Of the truth: channel, start, peak, decay and flux density at the peak of each burst.
+    let truth = table(&format!("{file}.moving.csv"));
+    // Integral of a linear rise and an exponential decay, until a time.
+    let until = |burst: &[f64], t_s: f64| {
+        let [start_s, peak_s, decay_s, peak_jy] = [burst[3], burst[4], burst[5], burst[6]];
+        let (risen, fallen) = ((t_s - start_s).clamp(0.0, peak_s - start_s), (t_s - peak_s).max(0.0));
+        peak_jy * (0.5 * risen * risen / (peak_s - start_s) + decay_s * (1.0 - (-fallen / decay_s).exp()))
+    };
+    let mut errors = Vec::new();
+    for number in 1..=2 {
+        let path = format!("{out}/event-{number:04}");
+        for value in table(&format!("{path}.csv")) {
+            let [channel, from_s, until_s, flux_jy, error_jy] = [0, 3, 4, 5, 6].map(|column| value[column]);
+            let of_channel = truth.iter().filter(|burst| burst[1] == channel);
+            let total = of_channel.map(|burst| until(burst, until_s) - until(burst, from_s)).sum::<f64>();
+            let true_jy = total / (until_s - from_s);
+            if true_jy > 1e6 {
+                errors.push((flux_jy - true_jy).abs() / error_jy);
+            }
+        }
+        assert!(std::fs::read(format!("{path}.png")).unwrap().starts_with(b"\x89PNG"));
+    }
+    let share =
+        |sigma: f64| errors.iter().filter(|error| **error < sigma).count() as f64 / errors.len() as f64;
+    let [one, two] = [1.0, 1.96].map(share);
+    // Decays of 11.5 and 9.7 s from 1e8 and 6.9e7 Jy to 1e6 Jy: 53 and 41 s in steps of 3 s. As if half of them were independent, of 0.68 and
+    // 0.95 three standard deviations are 0.23 and 0.11; errors of half or twice the scatter would have 0.38 and 0.67, or 0.95 and 1.
+    assert!(errors.len() > 50 && (0.45..0.91).contains(&one) && two > 0.84, "{one} {two}: {errors:?}");
+}
+
 #[test]
 fn bursts_are_not_looked_for_unless_asked() {
     let place = Workplace::new(MISSION);

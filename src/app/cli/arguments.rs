@@ -148,6 +148,29 @@ pub(super) fn frame(text: &str) -> Result<Frame, String> {
     Frame::from_coordsys(text).ok_or_else(|| "expected ecliptic, galactic or equatorial".to_owned())
 }
 
+/// Gains for the visibilities of downlink files.
+#[derive(Debug, Args)]
+pub(super) struct GainsArgs {
+    /// Map file (TOML), of which only the section calibration is used; by default that of the run that made the downlink.
+    #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
+    pub(super) map: Option<PathBuf>,
+    /// Gains that `lunarray calibrate` found.
+    #[arg(long, value_name = "GAINS.json")]
+    calibration: Option<PathBuf>,
+}
+
+impl GainsArgs {
+    /// The settings of downlink files, or of the map file if there is one.
+    pub(super) fn source(&self, files: &[PathBuf]) -> ConfigSource {
+        let gains = self.calibration.iter().map(|path| format!("{:?}", path.display().to_string()));
+        let of_file = |file: String| {
+            ["calibration.hook=antenna-gains".to_owned(), format!("calibration.gains_file={file}")]
+        };
+        let overrides = gains.flat_map(of_file).collect();
+        ConfigSource { file: self.map.clone(), overrides, seed: None }.with_downlink_settings(files).0
+    }
+}
+
 /// The map file of an existing state.
 #[derive(Debug, Args)]
 pub(super) struct StateMapArgs {

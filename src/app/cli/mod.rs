@@ -6,6 +6,7 @@
 mod arguments;
 mod bench;
 mod bound;
+mod bursts;
 mod calibrate;
 mod check;
 mod compare;
@@ -127,6 +128,7 @@ enum Command {
     Cutout(cutout::CutoutArgs),
     Calibrate(calibrate::CalibrateArgs),
     Bound(bound::BoundArgs),
+    Bursts(bursts::BurstsArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
@@ -276,6 +278,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Cutout(args) => cutout::execute(&args),
         Command::Calibrate(args) => calibrate::execute(&args),
         Command::Bound(args) => bound::execute(&args),
+        Command::Bursts(args) => bursts::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),

@@ -4,10 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::{input_path, output_path};
+use super::arguments::{GainsArgs, input_path, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::files::ProtectedInputs;
-use crate::pipeline::{ConfigSource, ZoomCentre, ZoomJob, ZoomReport, use_threads, zoom_downlink};
+use crate::pipeline::{ZoomCentre, ZoomJob, ZoomReport, use_threads, zoom_downlink};
 use crate::units::ChannelId;
 
 /// Greatest radius of a patch, degrees.
@@ -52,12 +52,8 @@ pub(super) struct ZoomArgs {
     /// Subtract sources of the catalogue outside the patch that are at least this bright, Jy.
     #[arg(long, value_name = "JY", requires = "catalogue")]
     subtract_jy: Option<f64>,
-    /// Map file (TOML), of which only the section calibration is used; by default that of the run that made the downlink.
-    #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
-    map: Option<PathBuf>,
-    /// Gains that `lunarray calibrate` found.
-    #[arg(long, value_name = "GAINS.json")]
-    calibration: Option<PathBuf>,
+    #[command(flatten)]
+    gains: GainsArgs,
     /// Output folder.
     #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
@@ -88,14 +84,8 @@ pub(super) fn execute(args: &ZoomArgs) -> CommandResult {
     above("radius-deg", args.radius_deg, RADIUS_DEG_MAX)?;
     args.pixel_arcmin.map_or(Ok(()), |arcmin| above("pixel-arcmin", arcmin, 600.0))?;
     args.baseline_max.map_or(Ok(()), |limit| above("baseline-max", limit, f64::MAX))?;
-    let mut overrides = Vec::new();
-    if let Some(path) = &args.calibration {
-        overrides.push("calibration.hook=antenna-gains".to_owned());
-        overrides.push(format!("calibration.gains_file={:?}", path.display().to_string()));
-    }
-    let source = ConfigSource { file: args.map.clone(), overrides, seed: None };
-    let config = source.with_downlink_settings(&args.files).0.load_ground()?;
-    let named = args.files.iter().chain(&args.map).chain(&args.catalogue).cloned();
+    let config = args.gains.source(&args.files).load_ground()?;
+    let named = args.files.iter().chain(&args.gains.map).chain(&args.catalogue).cloned();
     let _inputs = ProtectedInputs::of(named.chain(config.input_files()));
     use_threads(&config.runtime)?;
     let report = zoom_downlink(&ZoomJob {

@@ -28,11 +28,11 @@ pub use graph::{
 pub(crate) use graph::{Change, RunChanges};
 #[doc(hidden)]
 pub use jobs::{
-    ArraySensitivity, BoundSummary, CalibrateProgress, CalibrateWatcher, CaseSummary, Design, DesignCheck,
-    DesignObjective, DesignRuns, DesignStep, DesignSummary, JobEvent, JobWatcher, MERGE, MapStep,
-    NotCompared, PowerSpread, RealisationSpread, SENSITIVITY_L_MAX, Study, StudyCase, StudyError,
-    StudySummary, ZoomCentre, ZoomJob, ZoomReport, bound, breathing_m_s_per_year, channel_groups, has_powers,
-    joint_channels, replay_in_groups, run_design, run_in_groups, run_study, sample_state, simulate_in_groups,
-    solve_state, solve_states_jointly, with_gains, zoom_downlink,
+    ArraySensitivity, BoundSummary, BurstsReport, CalibrateProgress, CalibrateWatcher, CaseSummary, Design,
+    DesignCheck, DesignObjective, DesignRuns, DesignStep, DesignSummary, JobEvent, JobWatcher, MERGE,
+    MapStep, NotCompared, PowerSpread, RealisationSpread, SENSITIVITY_L_MAX, Study, StudyCase, StudyError,
+    StudySummary, ZoomCentre, ZoomJob, ZoomReport, bound, breathing_m_s_per_year, bursts_of_downlink,
+    channel_groups, has_powers, joint_channels, replay_in_groups, run_design, run_in_groups, run_study,
+    sample_state, simulate_in_groups, solve_state, solve_states_jointly, with_gains, zoom_downlink,
 };
 pub use jobs::{CalibrateJob, Mission, calibrate};

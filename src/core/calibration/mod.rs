@@ -29,8 +29,8 @@ pub use autos::{AUTOS_MAX, AutoTable};
 pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 #[doc(hidden)]
 pub use bursts::{
-    BurstAlert, BurstChoice, BurstSearch, BurstSummary, DividedBlock, FoundBurst, FoundBursts, LightCurve,
-    PassAlerts, find_alerts, find_bursts,
+    BurstAlert, BurstChoice, BurstEvent, BurstSearch, BurstSummary, ChannelCurve, DividedBlock, FluxPoint,
+    FoundBurst, FoundBursts, LightCurve, PassAlerts, find_alerts, find_bursts, find_events,
 };
 #[doc(hidden)]
 pub use config::{CalibrationConfig, CalibrationHook};

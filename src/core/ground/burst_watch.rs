@@ -94,6 +94,12 @@ impl BurstWatch {
         }
     }
 
+    /// Ends the open pass, and returns its visibilities by channel.
+    pub(super) fn take(&mut self) -> Vec<Vec<PlacedVisibilities>> {
+        let channels = mem::take(self).channels.into_values();
+        channels.map(|channel| channel.blocks.into_iter().map(|block| block.placed).collect()).collect()
+    }
+
     /// Ends the open pass: adds its bursts to a table, and returns the blocks of channels with bursts.
     pub(super) fn end(&mut self, search: BurstSearch, bursts: &FoundBursts) -> Vec<WatchedBlock> {
         let Self { channels, .. } = mem::take(self);

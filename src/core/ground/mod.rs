@@ -48,7 +48,7 @@ pub use pass_gate::{PassGateState, PassObserver};
 #[doc(hidden)]
 pub use pass_line::{KindLine, MissingRange, PassLine};
 #[doc(hidden)]
-pub use placed_files::read_placed;
+pub use placed_files::{read_passes, read_placed};
 #[doc(hidden)]
 pub use power_waterfall::PowerWaterfall;
 #[doc(hidden)]

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::burst_watch::BurstWatch;
 use super::core::missing_packets;
 use super::{Collector, GroundConfig, GroundError};
 use crate::calibration::CalibrationHook;
@@ -20,6 +21,47 @@ pub fn read_placed(
     ledger: &Ledger<VisibilityReason>,
     take: &mut dyn FnMut(&Instrument, &PlacedVisibilities),
 ) -> Result<(), GroundError> {
+    read_frames(config, files, ledger, &mut |instrument, frame| {
+        if let PlacedFrame::Visibilities(placed) = frame {
+            take(instrument, &placed);
+        }
+    })
+}
+
+/// Reads downlink files as [`read_placed`] does, and passes on the blocks of each pass, by channel. A pass ends as it does where bursts are
+/// looked for while data arrive, so that as much is in memory.
+///
+/// # Errors
+/// Those of [`read_placed`].
+pub fn read_passes(
+    config: &GroundConfig,
+    files: &[PathBuf],
+    ledger: &Ledger<VisibilityReason>,
+    take: &mut dyn FnMut(&Instrument, &[Vec<PlacedVisibilities>]),
+) -> Result<(), GroundError> {
+    let (mut watch, mut last) = (BurstWatch::default(), None);
+    read_frames(config, files, ledger, &mut |instrument, frame| {
+        if watch.is_ended_by(&frame) {
+            take(instrument, &watch.take());
+        }
+        if let PlacedFrame::Visibilities(placed) = frame {
+            ledger.add_accumulated(placed.len() as u64);
+            watch.keep(placed, &[], false);
+            last.get_or_insert_with(|| instrument.clone());
+        }
+    })?;
+    if let Some(instrument) = last {
+        take(&instrument, &watch.take());
+    }
+    Ok(())
+}
+
+fn read_frames(
+    config: &GroundConfig,
+    files: &[PathBuf],
+    ledger: &Ledger<VisibilityReason>,
+    take: &mut dyn FnMut(&Instrument, PlacedFrame),
+) -> Result<(), GroundError> {
     if config.calibration.hook == CalibrationHook::Solve {
         return Err(GroundError::GainsFromData);
     }
@@ -35,15 +77,15 @@ pub fn read_placed(
             }
             match calibrator.accept(frame) {
                 Ok(Some(PlacedFrame::Instrument(instrument))) => described = Some(instrument),
-                Ok(Some(PlacedFrame::Visibilities(placed))) => {
-                    if let Some(instrument) = &described {
-                        take(instrument, &placed);
-                    }
-                }
                 Ok(Some(PlacedFrame::NotMapped(counted))) => {
                     ledger.add_left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
                 }
-                Ok(_) => {}
+                Ok(Some(frame)) => {
+                    if let Some(instrument) = &described {
+                        take(instrument, frame);
+                    }
+                }
+                Ok(None) => {}
                 Err(error) => failure = failure.take().or(Some(error)),
             }
         })?;

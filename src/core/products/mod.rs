@@ -8,6 +8,7 @@
 
 mod autos;
 mod beam;
+mod burst_events;
 mod channel;
 mod comparison_pictures;
 mod config;
@@ -35,6 +36,8 @@ mod zoom;
 pub use autos::{AutoSummary, summarise, write_autos};
 #[doc(hidden)]
 pub use beam::EffectiveBeam;
+#[doc(hidden)]
+pub use burst_events::write_event;
 #[doc(hidden)]
 pub use comparison_pictures::{draw_comparison, draw_relative_error};
 #[doc(hidden)]

@@ -1,6 +1,7 @@
 //! Jobs that run several graphs: groups of channels, studies, noise realisations, rounds of calibration, maps of states.
 
 mod bound;
+mod bursts;
 mod calibrate;
 mod case;
 mod design;
@@ -21,6 +22,7 @@ mod study_file;
 mod zoom;
 
 pub use bound::{BoundSummary, bound};
+pub use bursts::{BurstsReport, bursts_of_downlink};
 pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
 pub use case::CaseSummary;
 pub use design::{DesignCheck, DesignRuns, DesignStep, DesignSummary, NotCompared, run_design};

@@ -407,7 +407,7 @@ fn seen_from_m(pairs: &[Vec<Entry>], [from_s, until_s]: [f64; 2]) -> [Vec3; 3] {
 }
 
 /// The visibilities in a span of time, for the fit of a light curve.
-fn rows_of<'a>(pairs: &[Vec<Entry<'a>>], [from_s, until_s]: [f64; 2]) -> Vec<BurstRow<'a>> {
+pub(super) fn rows_of<'a>(pairs: &[Vec<Entry<'a>>], [from_s, until_s]: [f64; 2]) -> Vec<BurstRow<'a>> {
     let row = |entry: &Entry<'a>| {
         let Entry { block, k, steady_k2_sr2, .. } = *entry;
         let half_s = 0.5 * block.duration_s.get(k).copied().map_or(0.0, f64::from);

@@ -5,6 +5,9 @@
 //!
 //! A burst is short against an integration, in which the fringe turns by up to an eighth: what is measured has the phase of when the burst was.
 //! Simulations that do not smear integrations have the phase of the middle.
+//!
+//! **Errors.** What the steady sky adds to a pair is alike in successive integrations, and a power changes within cells: the scatter of pairs, each of
+//! which has its own integrations, has both.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +25,14 @@ const CELLS: usize = 128;
 /// Shortest cell, s.
 const CELL_S_MIN: f64 = 0.5;
 
-/// Time in which the prior lets the power change by its largest value, s.
+/// Cells of a light curve, and fits of it with the prior of the one before.
+const CELLS_OF_CURVE: usize = 384;
+const ROUNDS: usize = 2;
+
+/// Least power in units of the largest by which the prior of a light curve lets it change.
+const CHANGE_MIN: f64 = 1e-3;
+
+/// Time in which the prior lets the power change by its largest value, or by that about it, s.
 const WALK_S: f64 = 5.0;
 
 /// Largest share of a pair in a flux whose error is found by pairs.
@@ -56,58 +66,60 @@ pub(super) struct Flux {
     factor: DenseFactor,
 }
 
-/// Length of a cell, s.
-fn cell_s([from_s, until_s]: [f64; 2]) -> f64 {
-    ((until_s - from_s) / CELLS as f64).max(CELL_S_MIN)
+/// Length of a cell, of at most some, s.
+fn cell_s([from_s, until_s]: [f64; 2], cells_max: usize) -> f64 {
+    ((until_s - from_s) / cells_max as f64).max(CELL_S_MIN)
 }
 
 /// All visibilities, or as many of them, evenly, as a fit may take: a thousand times more than those of short integrations need are refused. Lengths
 /// of integrations are untrusted.
 pub(super) fn affordable<'a>(rows: &[BurstRow<'a>], span_s: [f64; 2], work_max: f64) -> Vec<BurstRow<'a>> {
-    let work = |row: &BurstRow| (row.duration_s() / cell_s(span_s) + 2.0).min(CELLS as f64).powi(2);
+    let work = |row: &BurstRow| (row.duration_s() / cell_s(span_s, CELLS) + 2.0).min(CELLS as f64).powi(2);
     let work: f64 = rows.iter().map(|row| WORK_OF_ROW + work(row)).sum();
     rows.iter().step_by((work / work_max).ceil().max(1.0) as usize).copied().collect()
 }
 
 impl Flux {
     /// Fits the powers; `None` if the visibilities do not determine them.
-    pub(super) fn fit(rows: &[BurstRow], place: Place, [from_s, until_s]: [f64; 2]) -> Option<Self> {
-        let cell_s = cell_s([from_s, until_s]);
-        let cells = (((until_s - from_s) / cell_s).ceil() as usize).clamp(1, CELLS);
-        let power_k_sr = vec![0.0; cells];
-        let mut flux = Self { place, from_s, cell_s, power_k_sr, factor: DenseFactor::new(&[1.0], 1)? };
-        let (mut matrix, mut powers, mut largest_k_sr) = (vec![0.0; cells * cells], vec![0.0; cells], 0.0);
-        for row in rows {
-            let Some(term) = flux.term(row) else { continue };
-            // The part across the fringe says where the source is.
-            let (information, value) = (flux.information(row), term.value(row).re);
-            largest_k_sr = f64::max(largest_k_sr, value);
-            for (cell, factor) in &term.cells {
-                powers[*cell] += information * factor.re * value;
-                for (other, of_other) in &term.cells {
-                    matrix[cell * cells + other] += information * factor.re * of_other.re;
-                }
-            }
+    pub(super) fn fit(rows: &[BurstRow], place: Place, span_s: [f64; 2]) -> Option<Self> {
+        let sums = Sums::new(rows, place, span_s, CELLS)?;
+        let change = vec![sums.largest_k_sr; sums.powers.len() + 1];
+        sums.solved(&change)
+    }
+
+    /// Fits them in shorter cells: a power changes by what it is then, so that where there is none it is known better.
+    pub(super) fn fit_curve(rows: &[BurstRow], place: Place, span_s: [f64; 2]) -> Option<Self> {
+        let sums = Sums::new(rows, place, span_s, CELLS_OF_CURVE)?;
+        let cells = sums.powers.len();
+        let mut flux = sums.solved(&vec![sums.largest_k_sr; cells + 1])?;
+        for _ in 0..ROUNDS {
+            let inverse = flux.factor.inverse();
+            let sigma_k_sr = |cell: usize| (0.5 * inverse[cell * (cells + 1)]).max(0.0).sqrt();
+            let least_k_sr = CHANGE_MIN * flux.largest_k_sr();
+            let of_cell = |cell: usize| flux.power_k_sr[cell].abs().max(sigma_k_sr(cell)).max(least_k_sr);
+            let of_cells: Vec<f64> = (0..cells).map(of_cell).collect();
+            let reach = (WALK_S / flux.cell_s).ceil() as usize;
+            let about = |edge: usize| {
+                let near = edge.saturating_sub(reach + 1)..(edge + reach + 1).min(cells);
+                of_cells[near].iter().copied().fold(0.0, f64::max)
+            };
+            flux = sums.solved(&(0..=cells).map(about).collect::<Vec<f64>>())?;
         }
-        if largest_k_sr <= 0.0 {
-            return None;
-        }
-        // Information counts both parts of a visibility: half the inverse variance.
-        let tie = 0.5 * WALK_S / (cell_s * largest_k_sr * largest_k_sr);
-        for cell in 1..cells {
-            let before = cell - 1;
-            matrix[cell * (cells + 1)] += tie;
-            matrix[before * (cells + 1)] += tie;
-            matrix[cell * cells + before] -= tie;
-            matrix[before * cells + cell] -= tie;
-        }
-        // Before and after, there is no power.
-        matrix[0] += tie;
-        matrix[cells * cells - 1] += tie;
-        flux.factor = DenseFactor::new(&matrix, cells)?;
-        flux.factor.solve(&mut powers);
-        flux.power_k_sr = powers;
         Some(flux)
+    }
+
+    /// Sum over visibilities of their squared residuals in units of their variances.
+    pub(super) fn squares(&self, rows: &[BurstRow]) -> f64 {
+        let square = |row: &BurstRow| {
+            let term = self.term(row)?;
+            Some(self.information(row) * (term.value(row) - self.sum(&term)).norm_sqr())
+        };
+        rows.iter().filter_map(square).sum()
+    }
+
+    /// Length of a cell, s.
+    pub(super) fn cell_s(&self) -> f64 {
+        self.cell_s
     }
 
     /// Power of the brightest cell, K sr.
@@ -171,33 +183,119 @@ impl Flux {
 
     /// Mean power in a span, and its standard deviation, K sr: by what pairs, each by itself, say of it, and by the model, whose prior is not the
     /// burst.
-    pub(super) fn mean_k_sr(&self, rows: &[BurstRow], [from_s, until_s]: [f64; 2]) -> [f64; 2] {
+    pub(super) fn mean_k_sr(&self, rows: &[BurstRow], span_s: [f64; 2]) -> [f64; 2] {
+        let Mean { power_k_sr, by_pairs, by_model, .. } = self.mean(&self.residuals(rows), span_s);
+        [power_k_sr, (by_pairs + by_model).sqrt()]
+    }
+
+    /// What the fit leaves of visibilities that see the source, in the order of rows.
+    pub(super) fn residuals(&self, rows: &[BurstRow]) -> Vec<Residual> {
+        let residual = |row: &BurstRow| {
+            let term = self.term(row)?;
+            let value_k_sr = (term.value(row) - self.sum(&term)).re;
+            let cells = term.cells.iter().map(|(cell, factor)| (*cell, factor.re)).collect();
+            Some(Residual { pair: row.block.pair, information: self.information(row), value_k_sr, cells })
+        };
+        rows.iter().filter_map(residual).collect()
+    }
+
+    /// Mean power in a span.
+    pub(super) fn mean(&self, residuals: &[Residual], [from_s, until_s]: [f64; 2]) -> Mean {
         let start = |cell: usize| self.from_s + self.cell_s * cell as f64;
         let share = |cell: usize| {
             (start(cell + 1).min(until_s) - start(cell).max(from_s)).max(0.0) / (until_s - from_s)
         };
         let shares: Vec<f64> = (0..self.power_k_sr.len()).map(share).collect();
-        let mean = shares.iter().zip(&self.power_k_sr).map(|(share, power)| share * power).sum();
+        let power_k_sr = shares.iter().zip(&self.power_k_sr).map(|(share, power)| share * power).sum();
         let mut response = shares.clone();
         self.factor.solve(&mut response);
         // Of each pair: what its residuals add, and how much of the mean it determines.
         let mut pairs: BTreeMap<Pair, [f64; 2]> = BTreeMap::new();
-        for row in rows {
-            let Some(term) = self.term(row) else { continue };
-            let residual = (term.value(row) - self.sum(&term)).re;
-            let factor: f64 = term.cells.iter().map(|(cell, factor)| factor.re * response[*cell]).sum();
-            let inside = term.cells.iter().filter(|(cell, _)| shares[*cell] > 0.0);
-            let inside: f64 = inside.map(|(_, factor)| factor.re).sum();
-            let information = self.information(row);
-            let [sum, determined] = pairs.entry(row.block.pair).or_default();
-            *sum += information * factor * residual;
+        let mut is_seen = false;
+        for Residual { pair, information, value_k_sr, cells } in residuals {
+            let factor: f64 = cells.iter().map(|(cell, factor)| factor * response[*cell]).sum();
+            let inside = cells.iter().filter(|(cell, _)| shares[*cell] > 0.0);
+            let inside: f64 = inside.map(|(_, factor)| factor).sum();
+            is_seen |= inside != 0.0;
+            let [sum, determined] = pairs.entry(*pair).or_default();
+            *sum += information * factor * value_k_sr;
             *determined += information * factor * inside;
         }
         let square = |[sum, determined]: &[f64; 2]| (sum / (1.0 - determined.clamp(0.0, SHARE_MAX))).powi(2);
         let by_pairs: f64 = pairs.values().map(square).sum();
         let by_model: f64 =
             0.5 * shares.iter().zip(&response).map(|(share, response)| share * response).sum::<f64>();
-        [mean, (by_pairs + by_model).sqrt()]
+        Mean { power_k_sr, by_pairs, by_model, is_seen }
+    }
+}
+
+/// What a fit leaves of a visibility.
+pub(super) struct Residual {
+    pair: Pair,
+    information: f64,
+    value_k_sr: f64,
+    /// The cells in it, with their factors.
+    cells: Vec<(usize, f64)>,
+}
+
+/// A mean power, K sr, and its variance, (K sr)^2: by the scatter of pairs, and by the model.
+pub(super) struct Mean {
+    pub(super) power_k_sr: f64,
+    pub(super) by_pairs: f64,
+    pub(super) by_model: f64,
+    /// Whether a visibility saw the source then.
+    pub(super) is_seen: bool,
+}
+
+/// The normal equations of powers.
+struct Sums {
+    flux: Flux,
+    matrix: Vec<f64>,
+    powers: Vec<f64>,
+    /// Largest power that a visibility has.
+    largest_k_sr: f64,
+}
+
+impl Sums {
+    fn new(rows: &[BurstRow], place: Place, [from_s, until_s]: [f64; 2], cells_max: usize) -> Option<Self> {
+        let cell_s = cell_s([from_s, until_s], cells_max);
+        let cells = (((until_s - from_s) / cell_s).ceil() as usize).clamp(1, cells_max);
+        let power_k_sr = vec![0.0; cells];
+        let flux = Flux { place, from_s, cell_s, power_k_sr, factor: DenseFactor::new(&[1.0], 1)? };
+        let (mut matrix, mut powers, mut largest_k_sr) = (vec![0.0; cells * cells], vec![0.0; cells], 0.0);
+        for row in rows {
+            let Some(term) = flux.term(row) else { continue };
+            // The part across the fringe says where the source is.
+            let (information, value) = (flux.information(row), term.value(row).re);
+            largest_k_sr = f64::max(largest_k_sr, value);
+            for (cell, factor) in &term.cells {
+                powers[*cell] += information * factor.re * value;
+                for (other, of_other) in &term.cells {
+                    matrix[cell * cells + other] += information * factor.re * of_other.re;
+                }
+            }
+        }
+        (largest_k_sr > 0.0).then_some(Self { flux, matrix, powers, largest_k_sr })
+    }
+
+    /// The powers, with the change in [`WALK_S`] that the prior lets each have over the one before, K sr. Before and after, there is no power.
+    fn solved(&self, change_k_sr: &[f64]) -> Option<Flux> {
+        let Self { flux: Flux { place, from_s, cell_s, .. }, .. } = *self;
+        let (mut matrix, mut power_k_sr, cells) =
+            (self.matrix.clone(), self.powers.clone(), self.powers.len());
+        for (edge, change_k_sr) in change_k_sr.iter().enumerate() {
+            // Information counts both parts of a visibility: half the inverse variance.
+            let tie = 0.5 * WALK_S / (cell_s * change_k_sr * change_k_sr);
+            let sides = [edge.checked_sub(1), Some(edge).filter(|cell| *cell < cells)];
+            sides.into_iter().flatten().for_each(|cell| matrix[cell * (cells + 1)] += tie);
+            if let [Some(before), Some(after)] = sides {
+                matrix[after * cells + before] -= tie;
+                matrix[before * cells + after] -= tie;
+            }
+        }
+        let factor = DenseFactor::new(&matrix, cells)?;
+        factor.solve(&mut power_k_sr);
+        Some(Flux { place, from_s, cell_s, power_k_sr, factor })
     }
 }
 

@@ -3,6 +3,7 @@
 //! [`find_bursts`] sees all visibilities of a pass in one channel; [`FoundBursts`] is the table of what was found, which leaves
 //! visibilities that arrive later out as well.
 
+mod curve;
 mod detect;
 mod early;
 mod flux;
@@ -11,6 +12,7 @@ mod peel;
 mod refine;
 mod rows;
 
+pub use curve::{BurstEvent, ChannelCurve, FluxPoint, find_events};
 pub use detect::find_bursts;
 pub use early::{BurstAlert, PassAlerts, find_alerts};
 pub(super) use locate::{Sample, locate};

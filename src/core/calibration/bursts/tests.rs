@@ -1,6 +1,7 @@
 //! Bursts in simulated passes of the default array.
 
 mod arrival;
+mod curves;
 mod turning;
 
 use num_complex::Complex64;
