@@ -120,7 +120,7 @@ impl MapRequest<'_> {
 
     /// Whether an intermediate map was interrupted.
     pub(super) fn is_stopped(&self) -> bool {
-        !self.watch.may_continue() && !self.is_final
+        !self.is_final && !self.watch.may_continue()
     }
 }
 

@@ -92,6 +92,26 @@ impl ChannelFolder {
         }
     }
 
+    /// Whether there is a map, of this run or an earlier one.
+    fn has_map(&self) -> bool {
+        ["map.fits", LATEST_MAP].iter().any(|name| self.root.join(&self.name).join(name).exists())
+    }
+
+    /// Writes a final map that was interrupted, which says so, without all that its equations do not give. It replaces no other map.
+    fn write_interrupted(&mut self, shown: &ShownMaps, origin: Origin<'_>) -> Result<(), ProductsError> {
+        self.summary = Some(self.summarise(origin.solution, shown, None));
+        if self.has_map() {
+            return Ok(());
+        }
+        for name in ["map.fits", LATEST_MAP] {
+            self.write_described_map(name, &map_name(origin.solution), &shown.map, None, origin)?;
+        }
+        if self.config.pictures {
+            self.draw_map(shown, origin)?;
+        }
+        Ok(())
+    }
+
     /// Writes the products of one solution, and all products if it is final.
     ///
     /// If the files cannot be written, viewers still get the map, but the summary has no entry for it.
@@ -127,6 +147,9 @@ impl ChannelFolder {
             processing: None,
         };
         let origin = Origin { provenance, solution };
+        if solution.is_interrupted {
+            return self.write_interrupted(&solved, origin);
+        }
         let processed =
             self.config.processing().map(|processing| solved.processed(processing)).transpose()?;
         let shown = processed.as_ref().unwrap_or(&solved);
@@ -237,7 +260,11 @@ impl ChannelFolder {
             dipole_sigma_k: uncertainty.map(|found| found.dipole_sigma_k),
             sky_power: uncertainty.map(|found| found.power.clone()),
             gain_errors: uncertainty.and_then(|found| found.gains.clone()),
-            noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
+            interrupted: solution.interruption(),
+            noise_rms_k: match solution.is_interrupted {
+                true => f64::NAN,
+                false => (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
+            },
             diagnostics: solution.diagnostics,
             refinement: solution.refinement.clone(),
             snapshots: self.snapshots.clone(),
@@ -371,21 +398,31 @@ impl ChannelFolder {
         Ok(())
     }
 
+    /// Draws a final map; returns the line below its title.
+    fn draw_map(
+        &mut self,
+        shown: &ShownMaps,
+        Origin { provenance, solution }: Origin<'_>,
+    ) -> Result<String, ProductsError> {
+        let how = provenance.caption(solution);
+        let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution_text());
+        let warning = solution.interruption().map_or_else(String::new, |said| format!(", {said}"));
+        let title = format!("Map at {} MHz{warning}", self.frequency_hz / 1e6);
+        let panel = self.panel(shown.map.values(), &title, self.scale(shown));
+        let picture = draw_map(&panel, &subtitle, &view(self.config.frame))?;
+        self.write_picture("map", &picture)?;
+        picture.write(&self.register_file(LATEST_PICTURE))?;
+        Ok(subtitle)
+    }
+
     fn draw_final(
         &mut self,
         shown: &ShownMaps,
         comparison: Option<&Comparison>,
-        Origin { provenance, solution }: Origin<'_>,
+        origin: Origin<'_>,
     ) -> Result<(), ProductsError> {
-        let mhz = self.frequency_hz / 1e6;
-        let map = shown.map.values();
-        let scale = self.scale(shown);
-        let how = provenance.caption(solution);
-        let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution_text());
-        let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
-        let picture = draw_map(&panel, &subtitle, &view(self.config.frame))?;
-        self.write_picture("map", &picture)?;
-        picture.write(&self.register_file(LATEST_PICTURE))?;
+        let (solution, mhz) = (origin.solution, self.frequency_hz / 1e6);
+        let (subtitle, scale) = (self.draw_map(shown, origin)?, self.scale(shown));
         if let Some(input) = self.input(shown.processing).cloned() {
             let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
             let picture = draw_map(&panel, &shown.resolution_text(), &view(self.config.frame))?;

@@ -49,6 +49,12 @@ impl Provenance {
         ];
         cards.extend(self.regulariser_cards(solution));
         cards.extend(self.method_cards(solution, frequency_hz));
+        if let Some(interruption) = solution.interruption() {
+            if solution.refinement.is_none() {
+                cards.push(Card::logical("CONVERGD", false, "not the map of these data"));
+            }
+            cards.push(Card::text("WARNING", &interruption, ""));
+        }
         if let Some(PostProcessing { split, fwhm_deg }) = processing {
             let split = i64::try_from(split).unwrap_or(i64::MAX);
             cards.push(Card::integer("SPLIT", split, "parts along a side of a pixel of the map as solved"));
@@ -83,7 +89,7 @@ impl Provenance {
                 let l_max = i64::try_from(map.degree()).unwrap_or(i64::MAX);
                 cards.push(Card::integer("LMAX", l_max, "greatest degree of the solution"));
                 if let Some(refinement) = &solution.refinement {
-                    cards.extend(self.refinement_cards(refinement));
+                    cards.extend(self.refinement_cards(refinement, solution.has_converged()));
                 }
             }
         }
@@ -124,7 +130,7 @@ impl Provenance {
         cards
     }
 
-    fn refinement_cards(&self, refinement: &Refinement) -> Vec<Card> {
+    fn refinement_cards(&self, refinement: &Refinement, has_converged: bool) -> Vec<Card> {
         let iterations = i64::try_from(refinement.convergence.iterations).unwrap_or(i64::MAX);
         let antennas = match self.map.antennas.keys_set() {
             keys if keys.is_empty() => "ideal".to_owned(),
@@ -133,7 +139,7 @@ impl Provenance {
         vec![
             Card::integer("PASSES", iterations, "over visibilities, rows of true positions"),
             Card::real("RESIDUAL", refinement.convergence.residual, "of the equations, relative"),
-            Card::logical("CONVERGD", refinement.convergence.converged, "no more passes are needed"),
+            Card::logical("CONVERGD", has_converged, "no more passes are needed"),
             Card::logical("SMEARED", self.map.refine.smear_integrations, "rows averaged over integrations"),
             Card::text("ANTROWS", &antennas, ""),
         ]

@@ -74,7 +74,11 @@ pub struct ChannelSummary {
     /// The part of the errors of map and power that is by errors of the applied gains; absent where it is not among them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gain_errors: Option<GainUncertainty>,
-    /// RMS of the noise-only map, K.
+    /// That, and after how many iterations, an interruption ended the solution: errors are not known, and an earlier map was kept. Absent
+    /// without.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub interrupted: Option<String>,
+    /// RMS of the noise-only map, K; NaN if the solution was interrupted.
     pub noise_rms_k: f64,
     /// Regularisation and solver diagnostics of the final solution.
     pub diagnostics: Diagnostics,
@@ -155,6 +159,15 @@ impl ChannelSummary {
 
 impl fmt::Display for ChannelSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(interruption) = &self.interrupted {
+            let kept = if self.files.is_empty() { ": the earlier map was kept" } else { "" };
+            return write!(
+                f,
+                "{:>8.3} MHz  nside {}  {interruption}{kept}",
+                self.frequency_hz / 1e6,
+                self.nside
+            );
+        }
         write!(
             f,
             "{:>8.3} MHz  nside {}  {} visibilities  mean {}  noise {:.2e} K rms",

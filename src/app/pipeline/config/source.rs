@@ -11,6 +11,7 @@ use super::quantities::read_units;
 use super::reader::{KeyLocator, PartialConfig, parse_table};
 use super::sections::Config;
 use super::settings_path::apply_override;
+use crate::runtime::RuntimeConfig;
 
 const QUICKLOOK_NAME: &str = "embedded quicklook";
 /// The default pipeline, which is used if no file is named.
@@ -143,6 +144,7 @@ impl ConfigSource {
         if partial.config.name.is_empty() {
             partial.config.name = self.default_name();
         }
+        start_threads(&partial.config.runtime);
         // A map file without a space segment, or no file, does not know the orbits.
         let knows_orbits =
             is_whole || ["array", "sky", "spacecraft"].iter().any(|name| table.contains_key(*name));
@@ -221,6 +223,14 @@ fn drop_replaced(table: &mut toml::Table, keys: &[&str]) -> Vec<String> {
         }
     }
     notes
+}
+
+/// Starts the worker threads that a configuration asks for, as its checks use them already. The first configuration of a process decides:
+/// [`crate::pipeline::use_threads`] refuses another number, and numbers that cannot be.
+fn start_threads(config: &RuntimeConfig) {
+    if config.threads != 0 && config.problems().is_empty() {
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads).build_global();
+    }
 }
 
 #[cfg(test)]

@@ -2,9 +2,8 @@
 
 use std::path::Path;
 use std::sync::PoisonError;
-use std::sync::atomic::Ordering;
 
-use super::ground_segment::{SOLVE, SegmentOutcome};
+use super::ground_segment::SegmentOutcome;
 use super::joint::JointData;
 use super::live_gains::GainsWriter;
 use super::sample_summary::SampleSummary;
@@ -28,16 +27,14 @@ pub(in crate::pipeline) struct FinishedGraph {
 }
 
 impl FinishedGraph {
-    /// The results of a graph without samples. A run is also cancelled if its source had ended, but sums or maps lack data.
+    /// The results of a graph without samples. A run is cancelled by any signal before this, also after its source had ended.
     pub(super) fn new(
         mut report: Report,
         outcome: SegmentOutcome,
         listening: Option<Listening>,
         cancel: &Cancel,
     ) -> Self {
-        let left_data = outcome.ground.left_data.load(Ordering::Relaxed);
-        let lacks_maps = || report.stage(SOLVE).is_some_and(|solve| solve.items_out < solve.items_in);
-        report.cancelled |= cancel.is_cancelled() && (left_data || lacks_maps());
+        report.cancelled |= cancel.is_cancelled();
         Self { report, outcome, listening, samples: None }
     }
 

@@ -135,12 +135,16 @@ impl RunSummary {
         }
     }
 
-    /// Whether maps are missing because the grace period after cancellation was too short.
+    /// Whether maps are missing or not converged because the grace period after cancellation was too short.
     #[must_use]
     #[doc(hidden)]
     pub fn lacks_maps(&self) -> bool {
         let is_skipped = |solve: &StageReport| solve.items_out < solve.items_in;
-        self.cancelled && (!self.report.cut.is_empty() || self.report.stage(SOLVE).is_some_and(is_skipped))
+        let is_interrupted = |channel: &ChannelSummary| channel.interrupted.is_some();
+        self.cancelled
+            && (!self.report.cut.is_empty()
+                || self.report.stage(SOLVE).is_some_and(is_skipped)
+                || self.channels.iter().any(is_interrupted))
     }
 
     /// Writes `summary.json` into `folder`. Removes maps and pictures that the summary of an earlier run there names and
@@ -324,7 +328,7 @@ impl fmt::Display for RunSummary {
         if self.lacks_maps() {
             write!(
                 f,
-                "Ended early: runtime.grace_s left no time for all maps. Maps of channels that are not listed are missing or without all products."
+                "Ended early: runtime.grace_s left no time for all maps. Maps of channels that are not listed are missing or without all products; earlier ones are kept."
             )?;
         } else if self.cancelled && !self.report.cancelled {
             write!(f, "Ended early, without joint maps: all other products are complete.")?;

@@ -168,7 +168,7 @@ impl MapEquations for VisibilityArchive {
             solved => solved?,
         };
         // Only an interrupted solution is resumed.
-        if let Some(file) = file.filter(|_| request.watch.may_continue()) {
+        if let Some(file) = file.filter(|_| !request.setup.watch.was_cut()) {
             file.remove();
         }
         let HarmonicSolution { map_k, noise_k, diagnostics, uncertainty, .. } = solved;

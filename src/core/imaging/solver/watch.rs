@@ -73,6 +73,8 @@ struct WatchState {
     /// Number of tasks started so far.
     started: u64,
     current: Option<Solving>,
+    /// Whether cancellation ended a solution before its end, since [`SolveWatch::begin`].
+    was_cut: bool,
 }
 
 /// A watch with the name under which a solution reports to it.
@@ -84,7 +86,7 @@ pub struct NamedWatch<'a> {
     is_of_final_map: bool,
 }
 
-/// Maximum number of iterations of a solution that starts after cancellation: enough for the well-measured modes of a map.
+/// Maximum number of iterations of a solution that starts after cancellation without a time limit: enough for the well-measured modes of a map.
 const ITERATIONS_WHEN_CANCELLED: usize = 12;
 
 impl Default for SolveWatch {
@@ -134,6 +136,16 @@ impl SolveWatch {
         self.state().current.clone()
     }
 
+    /// Begins a solution of its own.
+    pub(in crate::imaging) fn begin(&self) {
+        self.state().was_cut = false;
+    }
+
+    /// Whether cancellation ended a part of the solution before its end, so that the map, its noise or its errors are not those of the data.
+    pub(in crate::imaging) fn was_cut(&self) -> bool {
+        self.state().was_cut
+    }
+
     /// The watch with a solution's name; see [`NamedWatch::of_final_map`] for its priority.
     #[must_use]
     pub fn named<'a>(&'a self, name: &'a str) -> NamedWatch<'a> {
@@ -164,7 +176,9 @@ impl<'a> NamedWatch<'a> {
 
     /// Whether the solution may continue on all ranks.
     pub(in crate::imaging) fn may_continue(self) -> bool {
-        self.all(self.may_continue_here())
+        let continues = self.all(self.may_continue_here());
+        self.watch.state().was_cut |= !continues;
+        continues
     }
 
     fn may_continue_here(self) -> bool {
@@ -206,7 +220,9 @@ impl SolveTask<'_> {
     /// Reports an iteration that needs another step if `needs_step`, and returns whether all ranks continue.
     pub(in crate::imaging) fn report_step(&self, needs_step: bool, iteration: usize, residual: f64) -> bool {
         // A rank that has converged takes part too: on other processors rounding may differ.
-        self.watch.ranks.all(self.report_here(iteration, residual) && needs_step)
+        let continues = self.watch.ranks.all(self.report_here(iteration, residual) && needs_step);
+        self.watch.state().was_cut |= needs_step && !continues;
+        continues
     }
 
     /// Reports several iterations that share products, and returns which of them continue on all ranks.
@@ -220,6 +236,8 @@ impl SolveTask<'_> {
         let mut stops: Vec<i64> =
             needs_step.iter().map(|needs_step| i64::from(!(continues && *needs_step))).collect();
         self.watch.ranks.max(&mut stops);
+        self.watch.state().was_cut |=
+            needs_step.iter().zip(&stops).any(|(needs, stops)| *needs && *stops != 0);
         stops.into_iter().map(|stops| stops == 0).collect()
     }
 
@@ -232,10 +250,12 @@ impl SolveTask<'_> {
                 None => (solving.iteration, solving.residual) = (iteration, residual),
             }
         }
-        if self.was_cancelled {
-            iteration < ITERATIONS_WHEN_CANCELLED && self.named.may_continue_here()
-        } else {
-            !self.watch.cancel.is_cancelled()
+        if self.named.is_of_final_map && self.watch.grace.is_some() {
+            return self.named.may_continue_here();
+        }
+        match self.was_cancelled {
+            true => iteration < ITERATIONS_WHEN_CANCELLED && self.named.may_continue_here(),
+            false => !self.watch.cancel.is_cancelled(),
         }
     }
 }

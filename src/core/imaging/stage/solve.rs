@@ -26,6 +26,8 @@ pub struct Solution {
     pub is_final: bool,
     /// Mission times of its first and last data, s.
     pub span_s: [f64; 2],
+    /// Whether cancellation ended its iterations, or those of its errors, early: the noise map is none, and there are no errors.
+    pub is_interrupted: bool,
     /// Number of visibilities in its sums.
     pub visibilities: u64,
     /// nside of the maps.
@@ -51,10 +53,18 @@ impl Solution {
         self.is_final && self.has_converged()
     }
 
-    /// Whether its refinement has converged; true without refinement.
+    /// Whether it was not interrupted, and its refinement, if any, has converged.
     #[must_use]
     pub fn has_converged(&self) -> bool {
-        self.refinement.as_ref().is_none_or(|refinement| refinement.convergence.converged)
+        !self.is_interrupted
+            && self.refinement.as_ref().is_none_or(|refinement| refinement.convergence.converged)
+    }
+
+    /// What is to be said with a map that was interrupted.
+    pub(crate) fn interruption(&self) -> Option<String> {
+        let refined = self.refinement.as_ref().map(|refinement| refinement.convergence);
+        let iterations = refined.or(self.diagnostics.convergence).map_or(0, |found| found.iterations);
+        self.is_interrupted.then(|| format!("not converged: interrupted after {iterations} iterations"))
     }
 }
 
@@ -123,6 +133,7 @@ impl Stage for Solver {
         if !watch.may_continue() {
             return Ok(());
         }
+        setup.watch.begin();
         let solved = data.solve(MapRequest {
             setup,
             instrument: &instrument,
@@ -137,13 +148,22 @@ impl Stage for Solver {
             watch,
         });
         let Some(solved) = solved? else { return Ok(()) };
-        let SolvedMap { map_k, noise_k, diagnostics, beams, refinement, uncertainty } = solved;
+        let is_interrupted = self.setup.watch.was_cut();
+        if is_interrupted && !is_final {
+            return Ok(());
+        }
+        let SolvedMap { map_k, noise_k, diagnostics, mut beams, refinement, mut uncertainty } = solved;
+        if is_interrupted {
+            // They are of equations that were not solved.
+            (beams, uncertainty) = (Vec::new(), None);
+        }
         self.solved += 1;
         out.push(Solution {
             instrument,
             channel,
             number,
             is_final,
+            is_interrupted,
             span_s,
             visibilities,
             nside,
