@@ -66,8 +66,9 @@ impl GainAssessment<'_> {
                 // If most daughters fit poorly, the model is wrong for the channel.
                 detectable.into_iter().for_each(|n| estimates[n].gains[c].state = GainState::PoorFit);
             }
-            let is_explained = |gain: &GainState| !matches!(gain, GainState::PoorFit | GainState::Unstable);
-            if good <= 1 && !estimates.iter().all(|one| is_explained(&one.gains[c].state)) {
+            let has = |state: GainState| estimates.iter().filter(|one| one.gains[c].state == state).count();
+            let (poor, unstable) = (has(GainState::PoorFit), has(GainState::Unstable));
+            if good <= 1 && (poor > 0 || unstable > 0 && good + unstable <= 1) {
                 // Noise cannot be told from a signal that is not the model's.
                 let states = estimates.iter_mut().map(|one| &mut one.gains[c].state);
                 states

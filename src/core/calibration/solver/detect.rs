@@ -51,7 +51,7 @@ pub(super) struct OwnGain {
     pub(super) information: f64,
     /// Information if the gains of the others were one.
     ideal: f64,
-    /// Information with all daughters, dropped ones included, gains of one, and noise alone.
+    /// Information with all daughters that are not dead, dropped ones included, gains of one, and noise alone.
     ideal_of_all: f64,
     pub(super) presence: SignalPresence,
 }
@@ -89,7 +89,8 @@ pub(super) fn is_pair_used(layout: &ParameterLayout, dropped_gains: &[bool], sum
     !dropped_gains[at + i] && !dropped_gains[at + j]
 }
 
-/// Gains of all daughters, by channel, then daughter, each from its pairs with daughters in the solution.
+/// Gains of all daughters, by channel, then daughter, each from its pairs with daughters in the solution. Pairs with a dead daughter say
+/// nothing of the other one.
 pub(super) fn solve_own_gains(
     config: &SolverConfig,
     layout: &ParameterLayout,
@@ -97,16 +98,61 @@ pub(super) fn solve_own_gains(
     sums: &[PairSums],
     dropped_gains: &[bool],
 ) -> Vec<OwnGain> {
+    let n = layout.satellites.max(1);
+    let mut left_out = dropped_gains.to_vec();
+    let mut has_data = vec![false; left_out.len()];
+    for sums in sums.iter().filter(|sums| sums.count > 0.0) {
+        [sums.pair.i, sums.pair.j].iter().for_each(|k| has_data[sums.channel * n + usize::from(*k)] = true);
+    }
+    // If all daughters of a channel that have data are left out, all are used.
+    for (channel, has_data) in left_out.chunks_mut(n).zip(has_data.chunks(n)) {
+        if channel.iter().zip(has_data).all(|(is_left_out, has_data)| *is_left_out || !has_data) {
+            channel.fill(false);
+        }
+    }
+    let none_dead = vec![false; left_out.len()];
+    let mut own = gains_beside(config, layout, values, sums, (&left_out, &none_dead));
+    let dead = dead_gains(&own, n);
+    if dead.contains(&true) {
+        own = gains_beside(config, layout, values, sums, (&left_out, &dead));
+    }
+    for (channel, dead) in own.chunks_mut(n).zip(dead.chunks(n)) {
+        // If no daughter is detected, the daughters are not the cause; unless other channels show which one is.
+        let is_any_detected = channel.iter().any(|own| own.presence == SignalPresence::Detected);
+        for (own, is_dead) in channel.iter_mut().zip(dead) {
+            if *is_dead {
+                own.presence = SignalPresence::Dead;
+            } else if own.presence == SignalPresence::Dead && !is_any_detected {
+                own.presence = SignalPresence::Unmodelled;
+            }
+        }
+    }
+    own
+}
+
+/// Gains that are dead: in a channel in which others are detected, or as in another such channel; `n` daughters.
+fn dead_gains(own: &[OwnGain], n: usize) -> Vec<bool> {
+    let is_any_detected: Vec<bool> = own
+        .chunks(n)
+        .map(|channel| channel.iter().any(|own| own.presence == SignalPresence::Detected))
+        .collect();
+    let is_dead = |k: usize| own[k].presence == SignalPresence::Dead;
+    let is_known = |daughter: usize| {
+        is_any_detected.iter().enumerate().any(|(c, detected)| *detected && is_dead(c * n + daughter))
+    };
+    (0..own.len()).map(|k| is_dead(k) && is_known(k % n)).collect()
+}
+
+/// Gains with pairs of those that are `left_out`, or that are `dead`, for themselves only.
+fn gains_beside(
+    config: &SolverConfig,
+    layout: &ParameterLayout,
+    values: &ParameterValues,
+    sums: &[PairSums],
+    (left_out, dead): (&[bool], &[bool]),
+) -> Vec<OwnGain> {
     let n = layout.satellites;
     let mut found = vec![GainSums::default(); n * layout.channels()];
-    // If all daughters of a channel are left out, all are used.
-    let mut left_out = dropped_gains.to_vec();
-    for channel in
-        left_out.chunks_mut(n.max(1)).filter(|channel| channel.iter().all(|is_dropped| *is_dropped))
-    {
-        channel.fill(false);
-    }
-    let dropped_gains = &left_out[..];
     for sums in sums {
         let [i, j] = [sums.pair.i, sums.pair.j].map(usize::from);
         let at = sums.channel * n;
@@ -116,27 +162,26 @@ pub(super) fn solve_own_gains(
         let model: f64 = (0..MODEL_TERMS).map(|k| u[k] * gram[k].re).sum();
         for (own, other, projection) in [(i, j, projection), (j, i, projection.conj())] {
             found[at + own].has_data |= sums.count > 0.0;
+            if dead[at + other] {
+                continue;
+            }
             found[at + own].ideal_of_all += model * sums.variance_factor;
-            if !dropped_gains[at + other] {
+            if !left_out[at + other] {
                 let gain = layout.gain(values, sums.channel, other);
                 found[at + own].add(projection * gain, [model * gain.norm_sqr(), model], sums);
             }
         }
     }
     let mut own: Vec<OwnGain> = found.into_iter().map(|sums| sums.gain(config)).collect();
+    let is_left: Vec<bool> = left_out.iter().zip(dead).map(|(a, b)| *a || *b).collect();
     for (c, channel) in own.chunks_mut(n.max(1)).enumerate() {
         // Gains fitted to noise agree with it.
-        let used = channel.iter().enumerate().filter(|(n_own, _)| !dropped_gains[c * n + n_own]);
+        let used = channel.iter().enumerate().filter(|(n_own, _)| !is_left[c * n + n_own]);
         let used = used.filter(|(_, own)| own.presence != SignalPresence::NoData).count();
         let required = DETECTED_SNR2 + DETECTED_SNR2_PER_DAUGHTER * used.saturating_sub(2) as f64;
-        if channel_snr_squared(layout, values, sums, dropped_gains, c) < required {
+        if channel_snr_squared(layout, values, sums, &is_left, c) < required {
             let detected = channel.iter_mut().filter(|own| own.presence == SignalPresence::Detected);
             detected.for_each(|own| own.presence = own.undetected_presence(config));
-        }
-        // If no daughter is detected, the daughters are not the cause.
-        if channel.iter().all(|own| own.presence != SignalPresence::Detected) {
-            let dead = channel.iter_mut().filter(|own| own.presence == SignalPresence::Dead);
-            dead.for_each(|own| own.presence = SignalPresence::Unmodelled);
         }
     }
     own

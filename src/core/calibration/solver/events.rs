@@ -27,8 +27,8 @@ pub enum InstrumentEvent {
         between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
-        /// Channels, from 0, and phase changes, deg.
-        channels: Vec<(usize, f64)>,
+        /// Channels, from 0, phase changes and their standard deviations, deg.
+        channels: Vec<(usize, f64, f64)>,
     },
     /// Amplitudes of a daughter changed.
     GainStep {
@@ -38,8 +38,8 @@ pub enum InstrumentEvent {
         between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
-        /// Channels, from 0, and factors of the amplitude.
-        channels: Vec<(usize, f64)>,
+        /// Channels, from 0, factors of the amplitude and their standard deviations.
+        channels: Vec<(usize, f64, f64)>,
     },
     /// A daughter delivers only noise from this pass on.
     Dead {
@@ -175,11 +175,11 @@ impl fmt::Display for InstrumentEvent {
                 )
             }
             Self::PhaseStep { pass, daughter, channels, between_s } => {
-                let (list, time_suffix) = (list(channels, " deg"), time_suffix(between_s));
+                let (list, time_suffix) = (steps(channels, " deg"), time_suffix(between_s));
                 write!(f, "pass {pass}: phases of daughter {daughter} changed by {list}{time_suffix}")
             }
             Self::GainStep { pass, daughter, channels, between_s } => {
-                let (factors, time_suffix) = (list(channels, ""), time_suffix(between_s));
+                let (factors, time_suffix) = (steps(channels, ""), time_suffix(between_s));
                 write!(
                     f,
                     "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}{time_suffix}"
@@ -241,6 +241,14 @@ impl fmt::Display for InstrumentEvent {
             }
         }
     }
+}
+
+/// Text with steps of channels, and their standard deviations.
+fn steps(channels: &[(usize, f64, f64)], unit: &str) -> String {
+    let each = channels
+        .iter()
+        .map(|(channel, value, sigma)| format!("{value:.4} +- {sigma:.4}{unit} in channel {channel}"));
+    each.collect::<Vec<_>>().join(", ")
 }
 
 /// Text with the time of an event, if it is known to 1 s.

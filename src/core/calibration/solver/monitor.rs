@@ -41,6 +41,8 @@ struct Change {
     /// Index of the later solution.
     solution: usize,
     daughter: usize,
+    /// Whether the later solution begins at a jump within a pass.
+    is_within_pass: bool,
     /// Changes of phases, rad.
     phases: Vec<ChannelChange>,
     /// Changes of log amplitudes.
@@ -71,7 +73,11 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
     for (index, solution) in solutions.iter().enumerate() {
         let of_solution: Vec<&Change> = changes.iter().filter(|change| change.solution == index).collect();
         let before = index.checked_sub(1).map(|previous| &solutions[previous]);
+        let known = events.len();
         add_step_events(&of_solution, before, solution, &mut events);
+        if events.len() == known {
+            events.extend(before.and_then(|before| unclear_step(before, solution)));
+        }
         add_state_events(before, solution, &mut events);
         add_model_events(before, solution, &mut named, &mut events);
         add_disturbance_events(solution, &mut events);
@@ -109,6 +115,7 @@ fn changes_between(solutions: &[PassSolution]) -> Vec<Change> {
             found.push(Change {
                 solution: index + 1,
                 daughter: n,
+                is_within_pass: two[1].begins_with_jump,
                 phases: pairs.iter().map(phase).collect(),
                 amplitudes: pairs.iter().map(amplitude).collect(),
             });
@@ -117,10 +124,10 @@ fn changes_between(solutions: &[PassSolution]) -> Vec<Change> {
     found
 }
 
-/// Raises standard deviations to the usual scatter of the daughter and channel from pass to pass.
+/// Raises standard deviations to the usual scatter of the daughter and channel from pass to pass; within a pass gains have none.
 fn inflate_sigmas(changes: &mut [Change], select: impl Fn(&mut Change) -> &mut Vec<ChannelChange>) {
     let mut sizes: std::collections::BTreeMap<(usize, usize), Vec<f64>> = Default::default();
-    for change in &mut *changes {
+    for change in changes.iter_mut().filter(|change| !change.is_within_pass) {
         let daughter = change.daughter;
         for ChannelChange { channel, change, .. } in select(change) {
             sizes.entry((daughter, *channel)).or_default().push(change.abs());
@@ -129,7 +136,7 @@ fn inflate_sigmas(changes: &mut [Change], select: impl Fn(&mut Change) -> &mut V
     for list in sizes.values_mut() {
         list.sort_unstable_by(f64::total_cmp);
     }
-    for change in changes {
+    for change in changes.iter_mut().filter(|change| !change.is_within_pass) {
         let daughter = change.daughter;
         for ChannelChange { channel, sigma, .. } in select(change) {
             let list = &sizes[&(daughter, *channel)];
@@ -217,14 +224,14 @@ fn add_step_events(
     let between_s = [before.map_or(solution.from_s, |before| before.until_s), solution.from_s];
     for change in changes {
         let daughter = change.daughter as u32 + 1;
-        let jumps = |changes: &[ChannelChange], convert: fn(f64) -> f64| -> Vec<(usize, f64)> {
-            changes.iter().filter(is_jump).map(|jump| (jump.channel, convert(jump.change))).collect()
+        let jumps = |changes: &[ChannelChange], convert: fn(&ChannelChange) -> Step| -> Vec<Step> {
+            changes.iter().filter(is_jump).map(convert).collect()
         };
-        let amplitudes = jumps(&change.amplitudes, f64::exp);
+        let amplitudes = jumps(&change.amplitudes, gain_step);
         if !amplitudes.is_empty() {
             events.push(InstrumentEvent::GainStep { pass, daughter, channels: amplitudes, between_s });
         }
-        let phases = jumps(&change.phases, f64::to_degrees);
+        let phases = jumps(&change.phases, phase_step);
         if phases.is_empty() {
             continue;
         }
@@ -233,6 +240,53 @@ fn add_step_events(
             None => InstrumentEvent::PhaseStep { pass, daughter, channels: phases, between_s },
         });
     }
+}
+
+/// Channel, size of a step and its standard deviation, as events tell it.
+type Step = (usize, f64, f64);
+
+fn gain_step(of: &ChannelChange) -> Step {
+    (of.channel, of.change.exp(), of.change.exp() * of.sigma)
+}
+
+fn phase_step(of: &ChannelChange) -> Step {
+    (of.channel, of.change.to_degrees(), of.sigma.to_degrees())
+}
+
+/// The most significant change at a jump that divides a pass, also of gains that are not good; `None` if the pass is not divided there.
+fn unclear_step(before: &PassSolution, solution: &PassSolution) -> Option<InstrumentEvent> {
+    if !solution.begins_with_jump || solution.pass != before.pass {
+        return None;
+    }
+    // Phases relative to one daughter, that of the part before.
+    let common = &solution.daughters.get(before.reference as usize - 1)?.gains;
+    let (mut best, mut most) = (None, 0.0);
+    for (n, (earlier, later)) in before.daughters.iter().zip(&solution.daughters).enumerate() {
+        for (channel, (a, b)) in earlier.gains.iter().zip(&later.gains).enumerate() {
+            let is_known = |gain: &GainEstimate| !matches!(gain.state, GainState::NoData | GainState::Dead);
+            let reference = &common[channel];
+            if !is_known(a) || !is_known(b) || !is_known(reference) {
+                continue;
+            }
+            let change = wrapped((b.phase_deg - reference.phase_deg - a.phase_deg).to_radians());
+            let sigma =
+                a.phase_sigma_deg.hypot(b.phase_sigma_deg).hypot(reference.phase_sigma_deg).to_radians();
+            let phase = ChannelChange { channel, change, sigma };
+            let sigma = a.amplitude_sigma.hypot(b.amplitude_sigma);
+            let amplitude = ChannelChange { channel, change: (b.amplitude / a.amplitude).ln(), sigma };
+            for (of, is_phase) in [(phase, true), (amplitude, false)] {
+                let significance = of.change.abs() / of.sigma;
+                if significance.is_finite() && significance > most {
+                    (best, most) = (Some((n as u32 + 1, of, is_phase)), significance);
+                }
+            }
+        }
+    }
+    let (pass, between_s) = (solution.pass, [before.until_s, solution.from_s]);
+    best.map(|(daughter, of, is_phase)| match is_phase {
+        true => InstrumentEvent::PhaseStep { pass, daughter, channels: vec![phase_step(&of)], between_s },
+        false => InstrumentEvent::GainStep { pass, daughter, channels: vec![gain_step(&of)], between_s },
+    })
 }
 
 /// Smallest rms phase change within a pass that is reported, deg.

@@ -15,6 +15,7 @@ use crate::units::{StreamKind, all_pairs, random_stream};
 mod correlation_tests;
 mod event_tests;
 mod fault_tests;
+mod few_pairs_tests;
 mod kind_tests;
 
 const DAUGHTERS: usize = 8;
@@ -391,7 +392,7 @@ fn a_jump_of_the_reference_is_distinguished_from_one_of_all() {
         let [InstrumentEvent::PhaseStep { daughter: 1, ref channels, .. }] = events[..] else {
             panic!("{events:?}")
         };
-        assert!(channels.iter().all(|(_, deg)| (deg - 57.3).abs() < 5.0), "{events:?}");
+        assert!(channels.iter().all(|(_, deg, _)| (deg - 57.3).abs() < 5.0), "{events:?}");
     }
     let found = outcome("all jump", |seed| solve(seed, true));
     assert_eq!(found.tally.wrong, 0);

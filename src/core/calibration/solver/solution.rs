@@ -268,7 +268,8 @@ impl CheckedFit {
             pass,
             from_s: interval.span_s[0],
             until_s: interval.span_s[1],
-            converged: newton.converged,
+            // Without data in the solution there is nothing to converge.
+            converged: newton.converged && count > 0.0,
             iterations: newton.iterations,
             visibilities: counts.used,
             outliers: counts.out,

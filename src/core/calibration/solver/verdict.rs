@@ -72,9 +72,28 @@ pub(super) fn model_verdict(
         return ModelVerdict::Weak;
     }
     if let Some(unexplained) = unexplained {
-        return ModelVerdict::Wrong { unexplained, fault: None };
+        // Gains that are left out explain nothing, and are not seen in what the others leave.
+        let unexplained = if unexplained < UNEXPLAINED_MIN { left_out(sums, &gains) } else { unexplained };
+        return if unexplained < UNEXPLAINED_MIN {
+            ModelVerdict::Weak
+        } else {
+            ModelVerdict::Wrong { unexplained, fault: None }
+        };
     }
-    let count = |is: fn(GainState) -> bool| gains.iter().filter(|gain| is(gain.state)).count();
+    // A daughter whose partners are all dead says nothing of the model.
+    let has_partner = |n: usize| {
+        let pairs = sums.iter().filter(|sums| sums.count > 0.0).map(|sums| [sums.pair.i, sums.pair.j]);
+        let mut others = pairs.filter_map(|[i, j]| match n {
+            n if n == usize::from(i) => Some(usize::from(j)),
+            n if n == usize::from(j) => Some(usize::from(i)),
+            _ => None,
+        });
+        others.any(|other| gains[other].state != GainState::Dead)
+    };
+    let count = |is: fn(GainState) -> bool| {
+        let chosen = gains.iter().enumerate().filter(|(n, gain)| is(gain.state) && has_partner(*n));
+        chosen.count()
+    };
     let with_data = count(|state| !matches!(state, GainState::NoData | GainState::Dead));
     if 2 * count(|state| state == GainState::Uncertain) > with_data
         && count(|state| state == GainState::Good) == 0
@@ -82,6 +101,23 @@ pub(super) fn model_verdict(
         return ModelVerdict::Weak;
     }
     ModelVerdict::Right
+}
+
+/// Significance, in standard deviations of noise, of the power of a signal.
+const POWER_SIGMAS: f64 = 3.0;
+
+/// Part of the power beyond noise that pairs with poor gains have; 0 where there may be noise alone.
+fn left_out(sums: &[PairSums], gains: &[&GainEstimate]) -> f64 {
+    let (mut all, mut poor, mut count) = (0.0, 0.0, 0.0);
+    for sums in sums.iter().filter(|sums| sums.count > 0.0) {
+        let excess = sums.variance_factor * sums.power - 2.0 * sums.count;
+        let is_poor =
+            [sums.pair.i, sums.pair.j].iter().any(|n| gains[usize::from(*n)].state == GainState::PoorFit);
+        all += excess;
+        poor += if is_poor { excess } else { 0.0 };
+        count += sums.count;
+    }
+    if all > POWER_SIGMAS * 2.0 * f64::sqrt(count) { (poor / all).clamp(0.0, 1.0) } else { 0.0 }
 }
 
 /// Whether other signals are stronger than an artificial one whose direction is right, or it is absent.

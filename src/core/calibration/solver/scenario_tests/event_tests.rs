@@ -29,7 +29,9 @@ fn a_step_of_one_channel_is_no_jump_of_the_clock() {
         let is_of_clock = changed.len() == 3 && turn_deg[0] != turn_deg[1];
         let is_right = match &events[..] {
             [InstrumentEvent::PhaseStep { pass: 3, daughter: told, channels, .. }] => {
-                *told as usize == daughter + 1 && !is_of_clock && channels.iter().map(|(c, _)| *c).eq(changed)
+                *told as usize == daughter + 1
+                    && !is_of_clock
+                    && channels.iter().map(|(c, ..)| *c).eq(changed)
             }
             [InstrumentEvent::ClockJump { pass: 3, daughter: told, change_ns, .. }] => {
                 let ns = -turn_deg[0] / (360e-9 * FREQUENCIES_HZ[0]);
