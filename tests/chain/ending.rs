@@ -262,3 +262,89 @@ fn interrupted_samples_leave_the_state_and_say_so() {
     assert!(lines.any(|line| line.contains("ended early: samples of 0 channels")));
     assert!(!Path::new(&out).exists() && files(Path::new(&state)) == before);
 }
+
+/// Maps of two channels, whose solutions take a while.
+const ITERATED: &str = r#"
+name = "iterated"
+[sky]
+nside = 16
+[spacecraft]
+channels_hz = ["3MHz", "10MHz"]
+thin = 600
+baseline_wavelengths_max = 16.0
+[map]
+engine = "harmonic"
+nside = 8
+[products]
+pictures = false
+"#;
+
+/// Requires of every channel the maps of `whole`, or, where there were none, maps that say that they are not converged.
+fn require_whole_or_marked(out: &Path, whole: &Path, had_maps: bool, said: &str) -> usize {
+    let mut marked = 0;
+    for channel in ["3.000MHz", "10.000MHz"] {
+        let read = |folder: &Path, name: &str| std::fs::read(folder.join(channel).join(name)).ok();
+        let names = ["map.fits", "latest.fits", "noise.fits", "sigma.fits", "mask.fits"];
+        if names.iter().all(|name| read(out, name) == read(whole, name)) {
+            continue;
+        }
+        assert!(!had_maps, "{channel}: a map was replaced\n{said}");
+        assert!(["noise.fits", "sigma.fits", "mask.fits"].iter().all(|name| read(out, name).is_none()));
+        // Or there was no time for any.
+        if let Some(map) = read(out, "map.fits") {
+            assert!(String::from_utf8_lossy(&map).contains("CONVERGD=                    F"), "{said}");
+            assert!(said.contains("not converged: interrupted after"), "{said}");
+            marked += 1;
+        }
+    }
+    marked
+}
+
+#[test]
+fn maps_whose_solution_is_interrupted_replace_none_and_say_so() {
+    let place = Workplace::new(ITERATED);
+    let file = place.simulate("sent.ccsds", &[]);
+    let (state, whole) = (place.path("state"), place.path("whole"));
+    let replay = |out: &str, more: &[&str]| {
+        let fixed = ["replay", &file, "--map", &place.pipeline, "--state", &state, "--out", out];
+        start(&[&fixed[..], more].concat())
+    };
+    let begun = std::time::Instant::now();
+    assert!(output(replay(&whole, &[])).status.success());
+    // A second session reads nothing anew: its time is that of the solutions.
+    let step = begun.elapsed() / 24;
+    let (mut cancelled, mut marked) = (0, 0);
+    for grace in ["0", "0.05"] {
+        for number in 0..12_u32 {
+            for had_maps in [false, true] {
+                let out = place.path(&format!("out-{grace}-{number}-{had_maps}"));
+                if had_maps {
+                    assert!(output(replay(&out, &[])).status.success());
+                }
+                let mut child = replay(&out, &["--set", &format!("runtime.grace_s={grace}")]);
+                std::thread::sleep(number * step);
+                let has_ended = child.try_wait().unwrap().is_some();
+                if !has_ended {
+                    signal(&child, "TERM");
+                }
+                let ended = output(child);
+                let said = String::from_utf8_lossy(&ended.stdout);
+                let out = Path::new(&out);
+                marked += require_whole_or_marked(out, Path::new(&whole), had_maps, &said);
+                // The signal may come before there is anything to save, or after the end.
+                match (ended.status.code(), ended.status.signal()) {
+                    (Some(143), _) => {
+                        let summary = std::fs::read_to_string(out.join("summary.json")).unwrap();
+                        assert!(summary.contains("\"cancelled\": true"), "{said}");
+                        assert!(said.contains("Ended early"), "{said}");
+                        cancelled += 1;
+                    }
+                    (Some(0), _) => assert!(!said.contains("Ended early"), "{said}"),
+                    (code, signal) => assert_eq!((code, signal), (None, Some(15)), "{said}"),
+                }
+            }
+        }
+    }
+    assert!(cancelled > 0, "no signal came in time");
+    println!("{cancelled} interrupted, {marked} maps marked");
+}

@@ -508,3 +508,30 @@ fn dates_of_orbits_give_epoch_earth_and_windows() {
             .contains("epoch 2026-12-31T23:59:23.000 UTC; the Earth is idealised")
     );
 }
+
+#[test]
+fn ellipses_take_any_number_of_threads() {
+    let pipeline = r#"
+        name = "e"
+        [sky]
+        nside = 8
+        [array]
+        eccentricity = 0.02
+        [spacecraft]
+        thin = 20000
+        baseline_wavelengths_max = 8
+        [map]
+        nside = 4
+        engine = "harmonic"
+        [map.refine]
+        passes_max = 6
+    "#;
+    let place = Workplace::new(pipeline);
+    for threads in ["1", "3"] {
+        let file = place.path(&format!("{threads}.ccsds"));
+        let set = format!("runtime.threads={threads}");
+        succeed(&["simulate", &place.pipeline, "--out", &file, "--set", &set]);
+    }
+    let read = |threads: &str| std::fs::read(place.path(&format!("{threads}.ccsds"))).unwrap();
+    assert!(read("1") == read("3"));
+}

@@ -20,7 +20,7 @@ use lunarray::units::vector::{norm, scale};
 use lunarray::units::{ChannelId, Pair, PerChannel};
 use num_complex::Complex64;
 
-fn instrument() -> Instrument {
+pub fn instrument() -> Instrument {
     Instrument {
         name: "forged".to_owned(),
         epoch_tai_s: 2e9,
@@ -36,7 +36,7 @@ fn instrument() -> Instrument {
 }
 
 /// Visibilities of the shortest pair over an orbit, of this weight, (K sr)^-2.
-fn block(weight: f64) -> PlacedVisibilities {
+pub fn block(weight: f64) -> PlacedVisibilities {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let times_s: Vec<f64> = (0..40).map(|k| 200.0 * f64::from(k)).collect();
     let at = |n: usize| times_s.iter().map(|&time_s| array.position_m(n, time_s)).collect();
@@ -149,6 +149,27 @@ fn what_is_beyond_follows_the_instrument() {
     assert_eq!(weight([at(3e6), at(6e6)].concat()), alone);
 }
 
+/// Settings of a solver without anything special.
+pub fn solver_setup(watch: SolveWatch) -> SolverSetup {
+    SolverSetup {
+        epsilon: PerChannel::All(1e-4),
+        regularisers: Vec::new(),
+        beams_deg: Vec::new(),
+        prior_k: PerChannel::All(0.0),
+        prior_maps: Vec::new(),
+        prior_hz: Vec::new(),
+        moon_reflection: 0.0,
+        rule: StoppingRule { residual_max: 1e-4, iterations_max: 100 },
+        refine: RefineRule { passes_max: 0, residual_max: 1e-4 },
+        assumed: AssumedInstrument::default(),
+        iteration_folder: None,
+        trace_probes: 0,
+        samples: Samples::default(),
+        kept: None,
+        watch,
+    }
+}
+
 /// Weights that rounding leaves nothing of: counted, and a matrix of zeros.
 #[test]
 fn a_snapshot_that_determines_no_map_waits_for_more() {
@@ -173,23 +194,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             nside: 2,
             data: Box::new(sums),
         };
-        let setup = SolverSetup {
-            epsilon: PerChannel::All(1e-4),
-            regularisers: Vec::new(),
-            beams_deg: Vec::new(),
-            prior_k: PerChannel::All(0.0),
-            prior_maps: Vec::new(),
-            prior_hz: Vec::new(),
-            moon_reflection: 0.0,
-            rule: StoppingRule { residual_max: 1e-4, iterations_max: 100 },
-            refine: RefineRule { passes_max: 0, residual_max: 1e-4 },
-            assumed: AssumedInstrument::default(),
-            iteration_folder: None,
-            trace_probes: 0,
-            samples: Samples::default(),
-            kept: None,
-            watch: SolveWatch::default(),
-        };
+        let setup = solver_setup(SolveWatch::default());
         let mut maps = Outlet::collect();
         let solved = Solver::new(setup).step(snapshot, &mut maps);
         (solved, maps.into_vec().len())

@@ -9,6 +9,7 @@ mod engines;
 mod epsilon;
 mod exact_sums;
 mod forged;
+mod interrupted;
 mod lengths;
 mod matrix_free;
 mod refined;
