@@ -169,25 +169,25 @@ fn errors_are_those_of_dense_matrices() {
             numbers("moments_sigma"),
             numbers("dipole")
         );
-        // Without a matrix the blocks are those of the nearest circle, as of harmonics.
-        let is_exact = engine == "pixel";
+        // Without a matrix the blocks are those of the nearest circle.
+        let (is_exact, has_matrix) = (engine == "pixel", engine != "free");
         // Pixels and numpy sum the same; harmonics are off by the kernels of the sums, which weak modes multiply, and numpy by its pixels.
         assert!(found["map"].as_f64().unwrap() < if is_exact { 1e-3 } else { 0.3 });
         let [sigma, scatter] = spread("sigma");
-        // Of pixels the window is a series, good to a tenth of a small part. Of harmonics sigma is that of the blocks, as if all phases were
-        // seen alike: data as few as these do not.
-        let tolerance = if is_exact { [0.02, 0.01] } else { [0.3, 0.2] };
+        // Of pixels the window is a series, good to a tenth of a small part. Rows of harmonics differ from numpy's over fine pixels by a hundredth.
+        // Blocks are as if all phases were seen alike: data as few as these do not.
+        let tolerance = if has_matrix { [0.02, 0.01] } else { [0.3, 0.2] };
         assert!((sigma - 1.0).abs() < tolerance[0] && scatter < tolerance[1], "{sigma} {scatter}");
         // Samples are of the true matrix: the variance of 60 is known to 18 %, its mean over pixels, of which some hundred are independent, to 2.
         // Both lack the degrees beyond.
         let [sampled, scatter] = spread("sampled");
         assert!((0.92..1.08).contains(&sampled) && scatter < 0.25, "{sampled} {scatter}");
         let [resolution, scatter] = spread("resolution");
-        let tolerance = if is_exact { 1e-5 } else { 0.08 };
+        let tolerance = if is_exact { 1e-5 } else { [0.08, 0.01][usize::from(has_matrix)] };
         assert!((resolution - 1.0).abs() < tolerance && scatter < tolerance, "{resolution} {scatter}");
         // Pixels at the edge of the mask. One of ones alone, or of zeros, would agree less.
         let (agrees, measured) = (found["mask"].as_f64().unwrap(), found["measured"].as_f64().unwrap());
-        let least = [("pixel", 0.99), ("free", 0.92), ("harmonic", 0.9)]
+        let least = [("pixel", 0.99), ("free", 0.92), ("harmonic", 0.99)]
             .iter()
             .find_map(|(name, least)| (*name == engine).then_some(*least))
             .unwrap();
