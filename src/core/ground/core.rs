@@ -174,6 +174,7 @@ impl Ground {
             match self.archive {
                 Some(_) if self.cancel.is_cancelled() => self.collector.hold_for_next_session(),
                 None if self.cancel.elapsed().is_some_and(|elapsed| elapsed >= self.cancel_grace) => {
+                    self.outcome.left_data.store(true, Ordering::Relaxed);
                     return Ok(());
                 }
                 _ => {}
@@ -370,6 +371,7 @@ impl Ground {
                 Some(GroundFrame::Visibilities(block))
                     if self.archive.is_some() && self.cancel.is_cancelled() =>
                 {
+                    self.outcome.left_data.store(true, Ordering::Relaxed);
                     self.calibrator.count_for_next_session(block);
                 }
                 _ => self.apply(delivery, out)?,

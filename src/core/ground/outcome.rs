@@ -1,7 +1,7 @@
 //! The results of the ground stage other than its sums.
 
 use std::fmt;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -41,6 +41,8 @@ pub struct GroundOutcome {
     pub saving: SharedSaving,
     /// The view for page visitors.
     pub live_view: LiveView,
+    /// Whether a cancelled run left data that were received out of the sums.
+    pub left_data: Arc<AtomicBool>,
 }
 
 /// Age of the oldest unsaved packet at which a checkpoint is due.

@@ -21,7 +21,7 @@ pub fn write_event(out: &Path, number: usize, event: &BurstEvent) -> Result<(), 
     let path = |ending: &str| out.join(format!("event-{number:04}.{ending}"));
     write_product(&path("csv"), csv(event))?;
     let from_s = event.from_s;
-    let title = format!("Burst {number}, from {from_s:.0} s");
+    let title = format!("Event {number}, from {from_s:.0} s");
     let values = raster(event);
     let rows = values.len() / COLUMNS;
     let raster = Raster {

@@ -55,7 +55,7 @@ pub(super) fn limits(diagnostics: &Diagnostics, refinement: Option<&Refinement>)
             "all degrees; may be too small for few data: lunarray sample"
         }
         (None, Some(_)) if diagnostics.errors_may_mislead => {
-            "degrees up to l_max; far too small: the node has not turned evenly"
+            "degrees up to l_max; may be far too small: the node turned little"
         }
         (None, Some(_)) => "degrees up to l_max",
         (None, None) => "all degrees, also those beyond the map's",

@@ -35,7 +35,8 @@ pub struct ChannelFigures {
     pub visibilities: u64,
     /// Mean of the map, K.
     pub mean_k: f64,
-    /// RMS of the noise-only map, K.
+    /// RMS of the noise-only map, K; NaN of a map that was interrupted.
+    #[serde(deserialize_with = "null_as_nan")]
     pub noise_rms_k: f64,
     /// Whether the visibilities contain thermal noise.
     pub thermal_noise: bool,
@@ -146,6 +147,11 @@ pub struct PowerFigures {
     pub cross_k2: Vec<Option<f64>>,
     /// C_l of the noise-only map.
     pub noise_k2: Option<Vec<Option<f64>>>,
+}
+
+/// A number that is not known is null.
+fn null_as_nan<'de, D: serde::Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(from)?.unwrap_or(f64::NAN))
 }
 
 impl RunFigures {

@@ -172,8 +172,8 @@ impl Config {
         (may_mislead && array.is_circle() && turn < EVEN_SHARE).then(|| {
             format!(
                 "in spacecraft.duration_s = {} the node turns by {:.1} of 360 deg: errors, mask and C_l of {} with R from the data may be far \
-                 from true (mean squares of (map - sky) / sigma 3 after 200 days, 5 after a month, 300 after a week); of single maps with map.nside \
-                 up to 16 they hold",
+                 from true (mean squares of (map - sky) / sigma 3 after 200 days, 5 after a month, 300 after a week); of single maps with map.l_max \
+                 up to 49 (nside 16) they hold",
                 spacecraft.duration_s,
                 360.0 * turn,
                 if joint.on { "joint maps" } else { "harmonic maps" },

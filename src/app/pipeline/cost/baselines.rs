@@ -73,7 +73,7 @@ impl Plan {
             self.to_map(cost).filter(|channel| is_unmapped(channel)).map(name).collect();
         (!unmapped.is_empty()).then(|| {
             format!(
-                "no map of {}: in the middle of no observing window is a baseline below the limit; expected a larger limit, or satellites \
+                "no map of {}: no baseline is below the limit in the middle of any observing window; expected a larger limit, or satellites \
                  closer together",
                 unmapped.join(", ")
             )

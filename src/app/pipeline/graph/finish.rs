@@ -2,8 +2,9 @@
 
 use std::path::Path;
 use std::sync::PoisonError;
+use std::sync::atomic::Ordering;
 
-use super::ground_segment::SegmentOutcome;
+use super::ground_segment::{SOLVE, SegmentOutcome};
 use super::joint::JointData;
 use super::live_gains::GainsWriter;
 use super::sample_summary::SampleSummary;
@@ -24,6 +25,8 @@ pub(in crate::pipeline) struct FinishedGraph {
     outcome: SegmentOutcome,
     listening: Option<Listening>,
     samples: Option<SampleSummary>,
+    /// Whether a signal ended its source, or left data or maps out.
+    pub(in crate::pipeline) is_incomplete: bool,
 }
 
 impl FinishedGraph {
@@ -34,8 +37,11 @@ impl FinishedGraph {
         listening: Option<Listening>,
         cancel: &Cancel,
     ) -> Self {
+        let left_data = outcome.ground.left_data.load(Ordering::Relaxed);
+        let lacks_maps = || report.stage(SOLVE).is_some_and(|solve| solve.items_out < solve.items_in);
+        let is_incomplete = report.cancelled || (cancel.is_cancelled() && (left_data || lacks_maps()));
         report.cancelled |= cancel.is_cancelled();
-        Self { report, outcome, listening, samples: None }
+        Self { report, outcome, listening, samples: None, is_incomplete }
     }
 
     /// With the samples' statistics.
@@ -64,7 +70,7 @@ pub(super) fn collect_and_write_summary(
     out: &Path,
     finished: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
-    if ranks.is_distributed() && finished.report.cancelled {
+    if ranks.is_distributed() && finished.is_incomplete {
         return Err(PipelineError::RankInterrupted);
     }
     if ranks.is_first() {
@@ -115,7 +121,7 @@ pub(in crate::pipeline) fn collect_summary(
     out: &Path,
     finished: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
-    let FinishedGraph { report, outcome, listening, samples } = finished;
+    let FinishedGraph { report, outcome, listening, samples, .. } = finished;
     let SegmentOutcome { ground, channels } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();

@@ -19,6 +19,7 @@ use crate::imaging::circle::SumPart;
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError, Plan};
 use crate::pipeline::cost::{GroupSize, MapGroup, RunGroups, map_groups};
 use crate::pipeline::graph::finish::{FinishedGraph, collect_summary, write_summary};
+use crate::pipeline::graph::ground_segment::SOLVE;
 use crate::pipeline::graph::run::{lock_products, run_ground, write_settings};
 use crate::pipeline::graph::summary::GroupRecord;
 use crate::pipeline::graph::{RunScope, RunSummary, downlink_file, space_segment};
@@ -108,14 +109,17 @@ impl GroupedReplay<'_> {
             }
             let finished =
                 self.read_group(MapStep { number, part: 0, parts: *parts }, truth, cancel, watch)?;
-            let autocorrelations = finished.autocorrelation_count();
+            let (autocorrelations, is_incomplete) =
+                (finished.autocorrelation_count(), finished.is_incomplete);
             let mut reading = collect_summary(scope, config, out, finished)?;
             if number > 0 {
                 // Each reading accumulates the auto-correlations of all channels; only those of the first count.
                 reading.ledger.accumulated = reading.ledger.accumulated.saturating_sub(autocorrelations);
             }
             let is_cancelled = reading.cancelled;
-            if is_cancelled && let Some(before) = done.pop() {
+            let is_cut =
+                is_incomplete || reading.channels.iter().any(|channel| channel.interrupted.is_some());
+            if is_cut && let Some(before) = done.pop() {
                 // The maps of this group hold less data than those of earlier groups, so the ledgers could not be merged.
                 reading.channels.iter().flat_map(|channel| &channel.files).for_each(|file| {
                     let _ = fs::remove_file(out.join(file));
@@ -130,10 +134,15 @@ impl GroupedReplay<'_> {
                 reading.earlier_reports = before.earlier_reports;
                 reading.earlier_reports.push(before.report);
             }
-            if !is_cancelled && !is_last {
+            if !is_cut && !is_last {
                 let record = GroupRecord::new(&reading, out)?;
                 record.write(&path, key)?;
-                done.push(record);
+                if is_cancelled {
+                    // Maps of an earlier run stay for the groups that are left.
+                    reading.report.cut.push(SOLVE.to_owned());
+                } else {
+                    done.push(record);
+                }
             }
             last = Some(reading);
             if is_cancelled {

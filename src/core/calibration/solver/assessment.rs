@@ -68,7 +68,7 @@ impl GainAssessment<'_> {
             }
             let has = |state: GainState| estimates.iter().filter(|one| one.gains[c].state == state).count();
             let (poor, unstable) = (has(GainState::PoorFit), has(GainState::Unstable));
-            if good <= 1 && (poor > 0 || unstable > 0 && good + unstable <= 1) {
+            if good <= 1 && (poor > 0 || (unstable > 0 && good + unstable <= 1)) {
                 // Noise cannot be told from a signal that is not the model's.
                 let states = estimates.iter_mut().map(|one| &mut one.gains[c].state);
                 states

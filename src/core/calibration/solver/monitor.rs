@@ -259,7 +259,7 @@ fn unclear_step(before: &PassSolution, solution: &PassSolution) -> Option<Instru
         return None;
     }
     // Phases relative to one daughter, that of the part before.
-    let common = &solution.daughters.get(before.reference as usize - 1)?.gains;
+    let common = &solution.daughters.get((before.reference as usize).checked_sub(1)?)?.gains;
     let (mut best, mut most) = (None, 0.0);
     for (n, (earlier, later)) in before.daughters.iter().zip(&solution.daughters).enumerate() {
         for (channel, (a, b)) in earlier.gains.iter().zip(&later.gains).enumerate() {

@@ -138,7 +138,7 @@ pub fn solve_refined(
             whole: &whole,
             nside: request.nside,
             rule: request.rule,
-            watch,
+            watch: watch.beside_map(),
         };
         posterior.uncertainty(request.samples, &|x| problem.normal(x))
     };

@@ -84,6 +84,7 @@ pub(in crate::imaging) fn view_sigma_k(
 ) -> Vec<f64> {
     if let [block] = blocks
         && block.places.len() == 1
+        && block.degrees.len() == (block.degrees.iter().max().map_or(0, |l| l + 1)).pow(2)
     {
         return whole_sigma_k(block, factors, weight, open, nside);
     }

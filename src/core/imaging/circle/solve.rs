@@ -108,7 +108,7 @@ pub fn solve_regularised(
             solved: &solved[0],
         };
         diagnostics.fit = Some(fitted.fit(area_sr));
-        let found = traces(sums, request.epsilon, w_max, request.probes, watch);
+        let found = traces(sums, request.epsilon, w_max, request.probes, watch.beside_map());
         diagnostics = diagnostics.with_traces(found, area_sr);
     }
     Ok(HarmonicSolution {
@@ -192,7 +192,7 @@ fn solve_with_power(
         whole: &whole,
         nside,
         rule,
-        watch,
+        watch: watch.beside_map(),
     };
     let errors = || posterior.uncertainty(samples, &|x| sums.apply_all(x));
     let uncertainty = watch.is_of_final_map().then(errors).transpose()?;

@@ -11,10 +11,12 @@
 use std::borrow::Cow;
 
 use faer::{Mat, Side};
+use rayon::prelude::*;
 
 use super::grid::ALPHAS;
 use super::stored::TorusPart;
 use super::{HarmonicSums, OrderBlocks, degrees};
+use crate::imaging::exact::fixed_point::parts::sum_of_parts;
 use crate::imaging::power::Block;
 use crate::imaging::solver::NamedWatch;
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
@@ -35,7 +37,7 @@ pub const EVEN_SHARE: f64 = 0.6;
 /// The equations of a map with R from the data.
 pub(super) enum PowerEquations<'a> {
     /// With blocks near their matrix.
-    ByOrder { sums: &'a HarmonicSums, blocks: OrderBlocks },
+    ByOrder { sums: &'a HarmonicSums, blocks: OrderBlocks, may_mislead: bool },
     /// With their whole matrix.
     Whole(WholeSums<'a>),
 }
@@ -57,16 +59,16 @@ impl<'a> PowerEquations<'a> {
         prior: Option<&[f64]>,
         watch: NamedWatch<'_>,
     ) -> Self {
-        let is_whole = watch.is_of_final_map()
-            && sums.unknowns() <= WHOLE_UNKNOWNS_MAX
-            && sums.is_node_even() == Some(false);
+        // Intermediate maps have no errors.
+        let may_mislead = watch.is_of_final_map() && sums.covered_share() < EVEN_SHARE;
+        let is_whole = may_mislead && sums.unknowns() <= WHOLE_UNKNOWNS_MAX;
         let whole = is_whole.then(|| WholeSums::new(sums, right, prior, watch)).flatten();
-        whole.map_or_else(|| Self::ByOrder { sums, blocks: sums.order_blocks() }, Self::Whole)
+        whole.map_or_else(|| Self::ByOrder { sums, blocks: sums.order_blocks(), may_mislead }, Self::Whole)
     }
 
     /// Whether C_l and errors may be far from true: the node has not turned evenly, and the matrix is too large to be stored.
     pub(super) fn may_mislead(&self) -> bool {
-        matches!(self, Self::ByOrder { sums, .. } if sums.is_node_even() == Some(false))
+        matches!(self, Self::ByOrder { may_mislead: true, .. })
     }
 
     pub(super) fn sums(&self) -> &dyn NormalSums {
@@ -131,7 +133,8 @@ impl<'a> WholeSums<'a> {
         let Ok(decomposed) = self.matrix.self_adjoint_eigen(Side::Lower) else { return self };
         let (values, vectors) = (decomposed.S().column_vector(), decomposed.U());
         let count = values.nrows();
-        let error = -values[0];
+        // At least rounding, if none is negative.
+        let error = (-values[0]).max(count as f64 * f64::EPSILON * values[count - 1]);
         let modes_of = |v: &[f64]| vectors.transpose() * Mat::from_fn(count, 1, |k, _| v[k]);
         let sum_of = |modes: &dyn Fn(usize) -> f64| {
             let sum = vectors * Mat::from_fn(count, 1, |k, _| modes(k));
@@ -207,26 +210,28 @@ impl NormalSums for WholeSums<'_> {
 }
 
 impl HarmonicSums {
-    /// Whether the weights cover enough of the node's turn for the blocks to be near the matrix; `None` of a rank's share, or if the sums could not
-    /// be read.
-    fn is_node_even(&self) -> Option<bool> {
-        (self.grids.share.count == 1).then(|| self.covered_share())?.map(|share| share >= EVEN_SHARE)
-    }
-
-    /// The share of the turn of the node that the weights w cover: `(sum w)^2 / (n sum w^2)` over n nodes.
-    pub(super) fn covered_share(&self) -> Option<f64> {
-        let stride = self.grids.weight_stride();
-        let mut weights = vec![0.0; self.grids.points];
-        for block in 0..self.grids.points.div_ceil(ALPHAS) {
-            let rows = self.tori.block(&self.grids, TorusPart::Weights, block)?;
+    /// The share of the turn of the node that the weights w cover: `(sum w)^2 / (n sum w^2)` over n values of alpha. NaN if the sums could not be
+    /// read. All ranks must ask for it.
+    pub(super) fn covered_share(&self) -> f64 {
+        let (grids, stride) = (&self.grids, self.grids.weight_stride());
+        let blocks = grids.points.div_ceil(ALPHAS);
+        let part = |block: usize| {
+            let mut weights = vec![0.0; grids.points];
+            let Some(rows) = self.tori.block(grids, TorusPart::Weights, block) else {
+                return vec![f64::NAN];
+            };
             for (k, weight) in weights[block * ALPHAS..].iter_mut().take(ALPHAS).enumerate() {
-                let rows = (0..self.grids.nodes.count).filter_map(|node| rows.row(node, k));
+                let rows = (0..grids.nodes.count).filter_map(|node| rows.row(node, k));
                 *weight = rows.flat_map(|row| &row[..stride]).map(|w| f64::from(*w)).sum();
             }
-        }
+            weights
+        };
+        let held: Vec<usize> = (0..blocks).filter(|block| grids.share.holds(*block)).collect();
+        let parts: Vec<Vec<f64>> = held.into_par_iter().map(part).collect();
+        let weights = sum_of_parts(&self.ranks, &parts, grids.points, blocks);
         let sum: f64 = weights.iter().sum();
         let squares: f64 = weights.iter().map(|w| w * w).sum();
-        Some(sum * sum / (weights.len() as f64 * squares))
+        sum * sum / (weights.len() as f64 * squares)
     }
 
     /// BtN^-1B over all unknowns; `None` if no time is left for it.

@@ -147,7 +147,7 @@ impl MapEquations for HarmonicSums {
             let epsilon = if power_k2.is_some() { 1.0 } else { request.epsilon };
             let regulariser = power_k2.map_or_else(|| regulariser.clone(), Regulariser::Wiener);
             let settings = HarmonicRequest { epsilon, ..settings };
-            beams = harmonic_beams(&self, settings, (&regulariser, w_max), &beam_pixels, watch)?;
+            beams = harmonic_beams(&self, settings, (&regulariser, w_max), &beam_pixels, watch.beside_map())?;
         }
         match (&request.setup.kept, request.is_final) {
             (_, false) => *request.last = Some(unknowns),

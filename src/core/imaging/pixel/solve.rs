@@ -107,7 +107,7 @@ pub fn solve_pixels_with(
     let LargestEigenvalue { value: w_max, iterations, .. } =
         largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.may_continue());
     // Before the factorisation, which overwrites the sums.
-    let traces = (probes > 0).then(|| traces(&sums, epsilon, w_max, probes, watch));
+    let traces = (probes > 0).then(|| traces(&sums, epsilon, w_max, probes, watch.beside_map()));
     let accuracy = sums.accuracy();
     let mut beams = beams.iter().map(|&pixel| point_response(&sums, pixel)).collect::<Result<Vec<_>, _>>()?;
     let PixelSums { mut normal, right, noise: mut noise_k, counts, .. } = sums;

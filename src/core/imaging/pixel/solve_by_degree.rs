@@ -137,7 +137,7 @@ impl Problem<'_> {
                 whole: &unknowns(&whole.alm),
                 nside: self.request.nside,
                 rule,
-                watch,
+                watch: watch.beside_map(),
             };
             let mut errors = posterior.uncertainty(self.request.samples, &|x| projected.apply_all(x))?;
             // What a sharp prior has beyond the degrees solved for.
@@ -221,14 +221,14 @@ impl Problem<'_> {
             regularisation: regularisation.clone(),
             precondition: &|v| factors.solve(v),
         };
-        let (mut found, rule) = (Vec::new(), self.request.rule);
+        let (mut found, rule, watch) = (Vec::new(), self.request.rule, self.watch.beside_map());
         for &pixel in pixels {
             let right = harmonics.harmonics_of(&point_response(sums, pixel)?.map_k)?;
             let mut beam = [vec![0.0; right.len()]];
-            let task = self.watch.start(&format!("beam at pixel {pixel}"), rule.residual_max);
+            let task = watch.start(&format!("beam at pixel {pixel}"), rule.residual_max);
             system.solve(&[&right], &mut beam, &[rule], &task);
             drop(task);
-            if !self.watch.may_continue() {
+            if !watch.may_continue() {
                 break;
             }
             found.push(PointBeam { pixel, map_k: harmonics.to_pixels(&beam[0])? });

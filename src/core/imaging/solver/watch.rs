@@ -73,8 +73,8 @@ struct WatchState {
     /// Number of tasks started so far.
     started: u64,
     current: Option<Solving>,
-    /// Whether cancellation ended a solution before its end, since [`SolveWatch::begin`].
-    was_cut: bool,
+    /// Whether cancellation ended a solution before its end, since [`SolveWatch::begin`]: that of a map, and what is computed beside it.
+    was_cut: [bool; 2],
 }
 
 /// A watch with the name under which a solution reports to it.
@@ -84,6 +84,8 @@ pub struct NamedWatch<'a> {
     name: &'a str,
     /// Whether it is of a final map, which may still begin after the run was cancelled, for few iterations and within the time limit.
     is_of_final_map: bool,
+    /// Whether what is computed is beside the map: errors, beams, traces.
+    is_beside_map: bool,
 }
 
 /// Maximum number of iterations of a solution that starts after cancellation without a time limit: enough for the well-measured modes of a map.
@@ -138,18 +140,23 @@ impl SolveWatch {
 
     /// Begins a solution of its own.
     pub(in crate::imaging) fn begin(&self) {
-        self.state().was_cut = false;
+        self.state().was_cut = [false; 2];
     }
 
-    /// Whether cancellation ended a part of the solution before its end, so that the map, its noise or its errors are not those of the data.
+    /// Whether cancellation ended the solution of the map and its noise map before its end, so that they are not those of the data.
     pub(in crate::imaging) fn was_cut(&self) -> bool {
-        self.state().was_cut
+        self.state().was_cut[0]
+    }
+
+    /// Whether it ended what is computed beside the map before its end.
+    pub(in crate::imaging) fn was_cut_beside(&self) -> bool {
+        self.state().was_cut[1]
     }
 
     /// The watch with a solution's name; see [`NamedWatch::of_final_map`] for its priority.
     #[must_use]
     pub fn named<'a>(&'a self, name: &'a str) -> NamedWatch<'a> {
-        NamedWatch { watch: self, name, is_of_final_map: true }
+        NamedWatch { watch: self, name, is_of_final_map: true, is_beside_map: false }
     }
 
     fn state(&self) -> MutexGuard<'_, WatchState> {
@@ -169,6 +176,18 @@ impl<'a> NamedWatch<'a> {
         Self { is_of_final_map, ..self }
     }
 
+    /// The watch of what is computed beside the map: if it ends early, the map is whole.
+    pub(in crate::imaging) fn beside_map(self) -> Self {
+        Self { is_beside_map: true, ..self }
+    }
+
+    /// Remembers what cancellation ended.
+    fn note_cut(self, is_cut: bool) {
+        // A rank does not know of signals to others.
+        let is_cancelled = self.watch.cancel.is_cancelled() || self.watch.ranks.is_distributed();
+        self.watch.state().was_cut[usize::from(self.is_beside_map)] |= is_cut && is_cancelled;
+    }
+
     /// Whether `holds` is true on all ranks.
     pub(in crate::imaging) fn all(self, holds: bool) -> bool {
         self.watch.ranks.all(holds)
@@ -177,7 +196,7 @@ impl<'a> NamedWatch<'a> {
     /// Whether the solution may continue on all ranks.
     pub(in crate::imaging) fn may_continue(self) -> bool {
         let continues = self.all(self.may_continue_here());
-        self.watch.state().was_cut |= !continues;
+        self.note_cut(!continues);
         continues
     }
 
@@ -221,7 +240,7 @@ impl SolveTask<'_> {
     pub(in crate::imaging) fn report_step(&self, needs_step: bool, iteration: usize, residual: f64) -> bool {
         // A rank that has converged takes part too: on other processors rounding may differ.
         let continues = self.watch.ranks.all(self.report_here(iteration, residual) && needs_step);
-        self.watch.state().was_cut |= needs_step && !continues;
+        self.named.note_cut(needs_step && !continues);
         continues
     }
 
@@ -236,8 +255,7 @@ impl SolveTask<'_> {
         let mut stops: Vec<i64> =
             needs_step.iter().map(|needs_step| i64::from(!(continues && *needs_step))).collect();
         self.watch.ranks.max(&mut stops);
-        self.watch.state().was_cut |=
-            needs_step.iter().zip(&stops).any(|(needs, stops)| *needs && *stops != 0);
+        self.named.note_cut(needs_step.iter().zip(&stops).any(|(needs, stops)| *needs && *stops != 0));
         stops.into_iter().map(|stops| stops == 0).collect()
     }
 

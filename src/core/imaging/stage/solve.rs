@@ -26,7 +26,7 @@ pub struct Solution {
     pub is_final: bool,
     /// Mission times of its first and last data, s.
     pub span_s: [f64; 2],
-    /// Whether cancellation ended its iterations, or those of its errors, early: the noise map is none, and there are no errors.
+    /// Whether cancellation ended its iterations early: the noise map is none, and there are no errors.
     pub is_interrupted: bool,
     /// Number of visibilities in its sums.
     pub visibilities: u64,
@@ -155,7 +155,10 @@ impl Stage for Solver {
         let SolvedMap { map_k, noise_k, diagnostics, mut beams, refinement, mut uncertainty } = solved;
         if is_interrupted {
             // They are of equations that were not solved.
-            (beams, uncertainty) = (Vec::new(), None);
+            beams.clear();
+        }
+        if is_interrupted || self.setup.watch.was_cut_beside() {
+            uncertainty = None;
         }
         self.solved += 1;
         out.push(Solution {

@@ -31,7 +31,7 @@ fn matrix_of(sums: &HarmonicSums) -> Mat<f64> {
 #[test]
 fn errors_of_a_short_mission_are_those_of_the_dense_inverse() {
     let sums = engine(&blocks(0, 15)).into_sums();
-    assert!(sums.covered_share().unwrap() < EVEN_SHARE);
+    assert!(sums.covered_share() < EVEN_SHARE);
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 300 };
     let request =
         HarmonicRequest { epsilon: 1.0, nside: NSIDE, rule, samples: Samples::default(), probes: 0 };
@@ -59,7 +59,7 @@ fn errors_of_a_short_mission_are_those_of_the_dense_inverse() {
             let product = &covariance * &column;
             let product: Vec<f64> = (0..at.len()).map(|k| product[(k, 0)]).collect();
             let expected = errors.power.noise_factor * dot(&at, &product).sqrt();
-            // Ratios of traces are from a draw that knows them to a percent.
+            // What counts errors of the matrix as noise changes the weakest modes, which R bounds.
             let ratio = errors.sigma_k[pixel] / expected;
             assert!((0.97..1.03).contains(&ratio), "{pixel}: {ratio}");
             expected
@@ -75,7 +75,7 @@ fn errors_of_a_short_mission_are_those_of_the_dense_inverse() {
 fn blocks_serve_an_even_turn_and_maps_without_time() {
     let right = |sums: &HarmonicSums| sums.right_hand_side().to_vec();
     let even = engine(&blocks(0, 100)).into_sums();
-    assert!(even.covered_share().unwrap() > EVEN_SHARE);
+    assert!(even.covered_share() > EVEN_SHARE);
     let watch = SolveWatch::default();
     let equations = PowerEquations::new(&even, &right(&even), None, watch.named("test"));
     assert!(matches!(equations, PowerEquations::ByOrder { .. }) && !equations.may_mislead());
