@@ -7,7 +7,7 @@ use crate::imaging::{MapConfig, RegulariserChoice};
 pub(in crate::imaging) const ITERATIONS: f64 = 11.0;
 
 /// Number of windows below which iterations grow, and the power of the fraction by which they do: 24 with 50 windows, 75 to 183 with 17.
-pub const WINDOWS_COVERED: f64 = 90.0;
+const WINDOWS_COVERED: f64 = 90.0;
 const COVERAGE_EXPONENT: f64 = 1.4;
 
 /// Maximum number of iterations of a solution from few windows, which determine few harmonics.
@@ -52,8 +52,8 @@ pub struct ChannelData {
     pub visibilities: f64,
     /// Number of observation windows.
     pub windows: f64,
-    /// Number of them in planes of their own: at most what the turn of the node has.
-    pub planes: f64,
+    /// Turns of the orbit's node.
+    pub node_turns: f64,
     /// Every so many integrations are sent.
     pub every_nth: f64,
     /// Number of maps: intermediate ones and the final one.
@@ -62,6 +62,13 @@ pub struct ChannelData {
     pub limb_range_rad: f64,
     /// Number of draws of the errors of applied gains; 0 if these are not known.
     pub error_draws: usize,
+}
+
+impl ChannelData {
+    /// Number of windows in planes of their own: at most what the turn of the node has.
+    pub(in crate::imaging) fn planes(&self) -> f64 {
+        self.windows.min(WINDOWS_COVERED * self.node_turns)
+    }
 }
 
 /// Usual number of iterations of a map from this many windows.
@@ -90,7 +97,7 @@ mod tests {
         frequency_hz: 1e7,
         visibilities: 25_000.0,
         windows: 200.0,
-        planes: 200.0,
+        node_turns: 1.0,
         every_nth: 1.0,
         solutions: 1,
         limb_range_rad: 0.05,

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::rates::{FRINGES_PER_S, SAMPLES_PER_S};
 use crate::frames::ObservingWindow;
-use crate::imaging::cost::{ChannelData, EngineCost, WINDOWS_COVERED};
+use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::rates::{AVERAGE_INSTANTS, cores};
 use crate::mother::{Fidelity, VISIBILITY_BYTES};
 use crate::pipeline::config::{Expected, MemoryLimit, PipelineError, Plan};
@@ -151,7 +151,7 @@ impl Plan {
                 frequency_hz,
                 visibilities: expected.mapped,
                 windows,
-                planes: windows.min(WINDOWS_COVERED * self.node_turns()),
+                node_turns: self.node_turns(),
                 every_nth: self.schedules[channel].every_nth as f64,
                 solutions,
                 limb_range_rad,

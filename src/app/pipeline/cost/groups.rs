@@ -155,7 +155,8 @@ pub(in crate::pipeline) fn complete_costs(
             frequency_hz,
             visibilities,
             windows: unlimited,
-            planes: unlimited,
+            // The whole matrix of a short mission counts.
+            node_turns: 0.0,
             every_nth: 1.0,
             solutions,
             limb_range_rad: unlimited,

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use super::REFINED_VISIBILITY_BYTES;
 use super::solve::{COLUMNS_AT_ONCE, can_be_formed};
 use crate::imaging::circle::harmonic_cost;
-use crate::imaging::cost::{ChannelData, EngineCost, WINDOWS_COVERED};
+use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::rates::{
     AVERAGE_INSTANTS, INNER_SOLUTION_FRACTION, INTERPOLATION_S, REFINED_ITERATIONS, ROW_FIXED_S, ROW_S,
     VISIBILITIES_PER_ROW, cores,
@@ -18,12 +18,15 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 const SUMMED_VISIBILITY_BYTES: f64 = 120.0;
 
 /// Number of planes below which a refinement converges slowly: with 17 and with those of a month it does, with 121 not (eccentricity 0.01).
-const PLANES_SLOW: f64 = 0.5 * WINDOWS_COVERED;
+const PLANES_SLOW: f64 = 45.0;
 
 /// The circle's sums, solved once per iteration; visibilities in memory; and tables of the true rows.
 pub(in crate::imaging) fn refined_cost(map: &MapConfig, data: ChannelData) -> EngineCost {
     let ChannelData { frequency_hz, visibilities, limb_range_rad, .. } = data;
     let data = ChannelData { error_draws: 0, ..data };
+    let planes = data.planes();
+    // The circle's matrix is no use to it as a whole.
+    let data = ChannelData { node_turns: 1.0, ..data };
     let circle = harmonic_cost(map, data);
     // Intermediate maps are solved on the nearest circle.
     let circle_final = harmonic_cost(map, ChannelData { solutions: 1, ..data });
@@ -46,7 +49,7 @@ pub(in crate::imaging) fn refined_cost(map: &MapConfig, data: ChannelData) -> En
     let iteration_s = product_s(2.0);
     // From few planes it converges slowly: with R from the data in twice as many solutions, each of which ends with the true matrix formed.
     let unknowns = (map.degree() + 1).pow(2);
-    let is_slow = data.planes < PLANES_SLOW;
+    let is_slow = planes < PLANES_SLOW;
     let rounds = if is_slow && map.regulariser() == RegulariserChoice::Data { 2.0 } else { 1.0 };
     let is_formed = is_slow && can_be_formed(unknowns, (visibilities / per_row) as usize);
     let together = COLUMNS_AT_ONCE as f64;

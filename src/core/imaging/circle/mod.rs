@@ -51,6 +51,7 @@ use std::io::Read;
 use std::sync::{Arc, OnceLock};
 
 pub use super::unknowns::{coefficients, degrees, unknowns, unknowns_of_gradient};
+pub(super) use beams::beams_with_power;
 pub use beams::harmonic_beams;
 pub use blocks::{OrderBlocks, OrderFactors};
 pub(super) use cost::harmonic_cost;

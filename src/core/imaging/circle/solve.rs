@@ -3,14 +3,14 @@
 use super::posterior::Posterior;
 use super::whole::PowerEquations;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
+use crate::imaging::NormalSums;
 use crate::imaging::SolveError;
-use crate::imaging::power::{MapsWithPower, PowerProblem, Samples, Uncertainty};
+use crate::imaging::power::{MapsWithPower, Samples, Uncertainty};
 use crate::imaging::regulariser::Regulariser;
 use crate::imaging::solver::{Convergence, Diagnostics, FitInputs, NamedWatch, StoppingRule};
 use crate::imaging::solver::{LargestEigenvalue, System, largest_eigenvalue_from, normalised, random_vector};
 use crate::imaging::solver::{add, check_request, dot, right_hand_side, traces};
 use crate::imaging::unknowns::degrees;
-use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};
 
@@ -120,30 +120,6 @@ pub fn solve_regularised(
     })
 }
 
-/// Estimates R from the data for solutions without a map.
-pub(super) fn power_of_data(
-    sums: &HarmonicSums,
-    rule: StoppingRule,
-    watch: NamedWatch<'_>,
-) -> Result<Regulariser, SolveError> {
-    check_request(sums, 1.0)?;
-    let order_blocks = sums.order_blocks();
-    let degrees: Vec<usize> = degrees(sums.setup().l_max).collect();
-    let (blocks, right) = (order_blocks.blocks(), sums.right_hand_side());
-    let SumCounts { visibilities, power, .. } = sums.counts();
-    let numbers = 2.0 * visibilities as f64;
-    let problem = PowerProblem {
-        sums,
-        blocks: &blocks,
-        coupling: None,
-        degrees: &degrees,
-        right,
-        data_chi2: power,
-        data_count: numbers,
-    };
-    Ok(Regulariser::Wiener(problem.solve(None, rule, watch)?.power.over_noise_k2()))
-}
-
 /// The part of `V'N^-1V` that a prior p explains, `p.(2 b - A p)`, with `right` = b - A p.
 fn predicted_power(sums: &HarmonicSums, prior: &[f64], right: &[f64]) -> f64 {
     dot(prior, sums.right_hand_side()) + dot(prior, right)
@@ -164,18 +140,10 @@ fn solve_with_power(
     let right = right_hand_side(sums, prior.as_deref())?;
     let equations = PowerEquations::new(sums, &right, prior.as_deref(), watch);
     let (blocks, degrees) = (equations.blocks(), degrees(l_max).collect::<Vec<usize>>());
-    let SumCounts { visibilities, power, .. } = sums.counts();
-    let data_chi2 = power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right));
-    let (sums, right) = (equations.sums(), equations.right(&right));
-    let problem = PowerProblem {
-        sums,
-        blocks: &blocks,
-        coupling: None,
-        degrees: &degrees,
-        right,
-        data_chi2,
-        data_count: 2.0 * visibilities as f64,
-    };
+    let data_chi2 =
+        sums.counts().power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right));
+    let (sums, right) = (equations.sums(), &equations.right(&right)[..]);
+    let problem = equations.problem(&blocks, &degrees, right, data_chi2);
     let MapsWithPower { found, columns, convergence } = problem.solve_maps(start, rule, watch)?;
     let [solved, noise] = columns;
     let mut whole = solved.clone();

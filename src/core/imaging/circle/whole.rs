@@ -17,8 +17,8 @@ use super::grid::ALPHAS;
 use super::stored::TorusPart;
 use super::{HarmonicSums, OrderBlocks, degrees};
 use crate::imaging::exact::fixed_point::parts::sum_of_parts;
-use crate::imaging::power::Block;
-use crate::imaging::solver::NamedWatch;
+use crate::imaging::power::{Block, PowerProblem};
+use crate::imaging::solver::{NamedWatch, dot};
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 
 /// Columns that are made at once: a thread has a workspace for each.
@@ -46,9 +46,27 @@ pub(super) enum PowerEquations<'a> {
 pub(super) struct WholeSums<'a> {
     sums: &'a HarmonicSums,
     matrix: Mat<f64>,
+    /// What right-hand sides go through; `None` if the matrix is as exact as it has to be.
+    filter: Option<Filter>,
     right: Vec<f64>,
     noise: Vec<f64>,
     gain_errors: Vec<Vec<f64>>,
+}
+
+/// Multiplies each eigenvector of a matrix by its share.
+struct Filter {
+    vectors: Mat<f64>,
+    shares: Vec<f64>,
+}
+
+impl Filter {
+    fn apply(&self, right: &[f64]) -> Vec<f64> {
+        let column = Mat::from_fn(right.len(), 1, |k, _| right[k]);
+        let mut modes = self.vectors.transpose() * column;
+        self.shares.iter().enumerate().for_each(|(k, share)| modes[(k, 0)] *= share);
+        let sum = &self.vectors * modes;
+        (0..right.len()).map(|k| sum[(k, 0)]).collect()
+    }
 }
 
 impl<'a> PowerEquations<'a> {
@@ -78,11 +96,25 @@ impl<'a> PowerEquations<'a> {
         }
     }
 
-    pub(super) fn right<'b>(&'b self, of_sums: &'b [f64]) -> &'b [f64] {
+    /// The right-hand side that belongs to one of the sums.
+    pub(super) fn right(&self, of_sums: &[f64]) -> Vec<f64> {
         match self {
-            Self::ByOrder { .. } => of_sums,
-            Self::Whole(whole) => &whole.right,
+            Self::Whole(WholeSums { filter: Some(filter), .. }) => filter.apply(of_sums),
+            _ => of_sums.to_vec(),
         }
+    }
+
+    /// The search for the power, with [`Self::blocks`] and [`Self::right`].
+    pub(super) fn problem<'b>(
+        &'b self,
+        blocks: &'b [Block<'b>],
+        degrees: &'b [usize],
+        right: &'b [f64],
+        data_chi2: f64,
+    ) -> PowerProblem<'b> {
+        let sums = self.sums();
+        let data_count = 2.0 * sums.counts().visibilities as f64;
+        PowerProblem { sums, blocks, coupling: None, degrees, right, data_chi2, data_count }
     }
 
     pub(super) fn blocks(&self) -> Vec<Block<'_>> {
@@ -116,7 +148,8 @@ impl<'a> WholeSums<'a> {
     ) -> Self {
         let noise = sums.noise_right_hand_side().to_vec();
         let gain_errors = sums.gain_error_right_hand_sides().to_vec();
-        let exact = Self { sums, matrix, right: right.to_vec(), noise, gain_errors };
+        let filter = None;
+        let exact = Self { sums, matrix, filter, right: right.to_vec(), noise, gain_errors };
         exact.with_error_as_noise(prior)
     }
 
@@ -131,34 +164,29 @@ impl<'a> WholeSums<'a> {
             return self;
         }
         let Ok(decomposed) = self.matrix.self_adjoint_eigen(Side::Lower) else { return self };
-        let (values, vectors) = (decomposed.S().column_vector(), decomposed.U());
-        let count = values.nrows();
+        let values: Vec<f64> = decomposed.S().column_vector().iter().copied().collect();
+        let [least, .., largest] = values[..] else { return self };
+        let count = values.len();
         // At least rounding, if none is negative.
-        let error = (-values[0]).max(count as f64 * f64::EPSILON * values[count - 1]);
-        let modes_of = |v: &[f64]| vectors.transpose() * Mat::from_fn(count, 1, |k, _| v[k]);
-        let sum_of = |modes: &dyn Fn(usize) -> f64| {
-            let sum = vectors * Mat::from_fn(count, 1, |k, _| modes(k));
-            (0..count).map(|k| sum[(k, 0)]).collect::<Vec<f64>>()
-        };
-        let modes = modes_of(&self.right);
-        let mut sky = sum_of(&|k| if values[k] > ACCURATE * error { modes[(k, 0)] / values[k] } else { 0.0 });
+        let error = (-least).max(count as f64 * f64::EPSILON * largest);
+        let inverse = |value: &f64| if *value > ACCURATE * error { value.recip() } else { 0.0 };
+        let vectors = decomposed.U().to_owned();
+        let mut filter = Filter { vectors, shares: values.iter().map(inverse).collect() };
+        let mut sky = filter.apply(&self.right);
         if let Some(prior) = prior {
             sky.iter_mut().zip(prior).for_each(|(sky, prior)| *sky += prior);
         }
-        let norm = sky.iter().map(|x| x * x).sum::<f64>();
-        let noise = error * error * norm / count as f64;
-        let share = |k: usize| if values[k] > 0.0 { values[k] / (values[k] + noise) } else { 0.0 };
-        let scaled = Mat::from_fn(count, count, |i, k| vectors[(i, k)] * share(k) * values[k]);
-        let filtered = |v: &[f64]| {
-            let modes = modes_of(v);
-            sum_of(&|k| share(k) * modes[(k, 0)])
-        };
+        let noise = error * error * dot(&sky, &sky) / count as f64;
+        let share = |value: &f64| if *value > 0.0 { value / (value + noise) } else { 0.0 };
+        filter.shares = values.iter().map(share).collect();
+        let scaled = |i: usize, k: usize| filter.vectors[(i, k)] * filter.shares[k] * values[k];
         Self {
             sums: self.sums,
-            matrix: &scaled * vectors.transpose(),
-            right: filtered(&self.right),
-            noise: filtered(&self.noise),
-            gain_errors: self.gain_errors.iter().map(|v| filtered(v)).collect(),
+            matrix: Mat::from_fn(count, count, scaled) * filter.vectors.transpose(),
+            right: filter.apply(&self.right),
+            noise: filter.apply(&self.noise),
+            gain_errors: self.gain_errors.iter().map(|v| filter.apply(v)).collect(),
+            filter: Some(filter),
         }
     }
 }

@@ -7,12 +7,12 @@ use crate::frames::{PlacedVisibilities, VisibilityReason};
 use crate::imaging::anywhere::SegmentFolder;
 use crate::imaging::circle::{
     HarmonicEngine, HarmonicRequest, HarmonicSetup, HarmonicSolution, HarmonicSums, NoiseSums, SumPart,
-    harmonic_beams, harmonic_cost, nominal_orbit, solve_regularised,
+    beams_with_power, harmonic_beams, harmonic_cost, nominal_orbit, solve_regularised,
 };
 use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::method::{MapEquations, MapMethod, MapSums, NewChannel, NewOrRefused, same_method};
 use crate::imaging::request::{MapRequest, SolvedMap};
-use crate::imaging::{AccumulationError, Added, MapConfig, NormalEngine, NormalSums, Regulariser};
+use crate::imaging::{AccumulationError, Added, MapConfig, NormalEngine, NormalSums};
 use crate::imaging::{SolveError, SumCounts};
 use crate::ranks::{RankShare, Ranks};
 use crate::sky::healpix::pixel_area_sr;
@@ -141,13 +141,18 @@ impl MapEquations for HarmonicSums {
         let HarmonicSolution { map_k, noise_k, unknowns, diagnostics, uncertainty } = solved;
         let (mut beams, beam_pixels) = (Vec::new(), request.beam_pixels());
         if !beam_pixels.is_empty() {
-            let w_max = diagnostics.w_max.unwrap_or(0.0) / pixel_area_sr(request.nside);
-            // Beams use the R that was found from the data.
-            let power_k2 = uncertainty.as_ref().map(|errors| errors.power.over_noise_k2());
-            let epsilon = if power_k2.is_some() { 1.0 } else { request.epsilon };
-            let regulariser = power_k2.map_or_else(|| regulariser.clone(), Regulariser::Wiener);
-            let settings = HarmonicRequest { epsilon, ..settings };
-            beams = harmonic_beams(&self, settings, (&regulariser, w_max), &beam_pixels, watch.beside_map())?;
+            let watch = watch.beside_map();
+            beams = match &uncertainty {
+                // Beams use the R that was found from the data.
+                Some(errors) => {
+                    let r = errors.power.over_noise_k2().into_iter().map(f64::recip).collect();
+                    beams_with_power(&self, settings, r, &beam_pixels, watch)?
+                }
+                None => {
+                    let w_max = diagnostics.w_max.unwrap_or(0.0) / pixel_area_sr(request.nside);
+                    harmonic_beams(&self, settings, (regulariser, w_max), &beam_pixels, watch)?
+                }
+            };
         }
         match (&request.setup.kept, request.is_final) {
             (_, false) => *request.last = Some(unknowns),

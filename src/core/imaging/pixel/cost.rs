@@ -75,7 +75,7 @@ const BLOCKS_BP_MAX: f64 = 100.0;
 
 /// Products of a final map with R from the data.
 fn data_products(data: ChannelData, iterations_max: f64) -> f64 {
-    let grown = (DATA_PLANES / data.planes.max(1.0)).max(1.0);
+    let grown = (DATA_PLANES / data.planes().max(1.0)).max(1.0);
     let products = DATA_PRODUCTS_BY_MHZ * (data.frequency_hz / 1e6).max(1.0) * grown;
     products.min(DATA_SOLUTIONS_MAX * iterations_max)
 }
@@ -104,7 +104,8 @@ pub(in crate::imaging) fn matrix_free_cost(map: &MapConfig, data: ChannelData) -
     } else {
         // Blocks reach as far as the data; a limit far beyond them says nothing.
         let map = &MapConfig { baseline_bp_max: map.baseline_bp_max.min(BLOCKS_BP_MAX), ..map.clone() };
-        let circle = harmonic_cost(map, ChannelData { solutions: 1, error_draws: 0, ..data });
+        let circle =
+            harmonic_cost(map, ChannelData { solutions: 1, error_draws: 0, node_turns: 1.0, ..data });
         circle.sums_bytes + circle.copy_bytes + circle.other_bytes
     };
     let held = visibilities * REFINED_VISIBILITY_BYTES as f64;
@@ -276,7 +277,7 @@ mod tests {
                 frequency_hz,
                 visibilities,
                 windows: windows as f64,
-                planes: windows as f64,
+                node_turns: 1.0,
                 every_nth: 1.0,
                 solutions: 1,
                 limb_range_rad: 0.0,
@@ -311,7 +312,7 @@ mod tests {
                 frequency_hz,
                 visibilities,
                 windows,
-                planes: windows,
+                node_turns: 1.0,
                 every_nth: 1.0,
                 solutions: 1,
                 limb_range_rad: 0.0,

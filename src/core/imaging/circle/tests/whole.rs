@@ -70,6 +70,46 @@ fn errors_of_a_short_mission_are_those_of_the_dense_inverse() {
     assert!(most > 1.2 * least, "{least} {most}");
 }
 
+/// Beams and noise maps of such a mission are of the equations of its map.
+#[test]
+fn beams_and_noise_maps_of_a_short_mission_are_of_its_matrix() {
+    let mut sums = engine(&blocks(0, 15)).into_sums();
+    let rule = StoppingRule { residual_max: 1e-8, iterations_max: 300 };
+    let request =
+        HarmonicRequest { epsilon: 1.0, nside: NSIDE, rule, samples: Samples::default(), probes: 0 };
+    let watch = SolveWatch::default();
+    let watch = watch.named("test");
+    let found = solve_regularised(&sums, request, &Regulariser::Data, None, None, watch).unwrap();
+    let r: Vec<f64> = found.uncertainty.unwrap().power.over_noise_k2().iter().map(|c| c.recip()).collect();
+    let rms = |map: &[f64]| (dot(map, map) / map.len() as f64).sqrt();
+    let differ = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<f64>>();
+
+    sums.noise_realisations = vec![sums.noise_right_hand_side().to_vec()];
+    let noises = solve_noises(&sums, request, &Regulariser::Data, watch).unwrap();
+    // The power is found anew from the same data, to the tolerance of its rounds at the worst.
+    assert!(rms(&differ(&noises[0], &found.noise_k)) < 0.02 * rms(&found.noise_k));
+
+    let equations = PowerEquations::new(&sums, sums.right_hand_side(), None, watch);
+    let PowerEquations::Whole(whole) = &equations else { panic!("blocks") };
+    let mut regularised = whole.matrix().clone();
+    for (k, l) in degrees(L_MAX).enumerate() {
+        regularised[(k, k)] += r[l];
+    }
+    let transform = Transform::new(NSIDE, L_MAX).unwrap();
+    let mut point = vec![0.0; 12 * NSIDE * NSIDE];
+    point[300] = 1.0;
+    let sky = unknowns(&transform.adjoint(&point).unwrap());
+    let mut right = vec![0.0; sky.len()];
+    whole.apply(&sky, &mut right);
+    let column = Mat::from_fn(sky.len(), 1, |k, _| right[k]);
+    let solved = regularised.llt(Side::Lower).unwrap().inverse() * column;
+    let solved: Vec<f64> = (0..sky.len()).map(|k| solved[(k, 0)]).collect();
+    let expected = transform.synthesis(&coefficients(&solved, L_MAX)).unwrap();
+    let beams = beams_with_power(&sums, request, r, &[300], watch).unwrap();
+    // By iterations to 1e-8 of the residual, and an inverse in f64 with condition numbers below 1e9.
+    assert!(rms(&differ(&beams[0].map_k, &expected)) < 1e-5 * rms(&expected));
+}
+
 /// Where the node has turned evenly blocks do, and where the map has no time left they have to.
 #[test]
 fn blocks_serve_an_even_turn_and_maps_without_time() {
