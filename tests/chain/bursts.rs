@@ -315,7 +315,12 @@ fn light_curves_are_those_of_the_truth_within_their_errors() {
     let place = Workplace::new(&mission.replace("[15.0, 32.0, 52.0, 80.0, 120.0, 170.0, 240.0]", arcs));
     let file = place.simulate("bursts.ccsds", &["--set", BURSTS]);
     let out = place.path("light-curves");
+    // An earlier command had three events.
+    std::fs::create_dir(&out).unwrap();
+    std::fs::write(format!("{out}/summary.json"), r#"{"events": [{}, {}, {}]}"#).unwrap();
+    std::fs::write(format!("{out}/event-0003.csv"), "old").unwrap();
     let report = json(&["bursts", &file, "--out", &out]);
+    assert!(!std::fs::exists(format!("{out}/event-0003.csv")).unwrap());
     let found: Vec<usize> =
         report["events"].as_array().unwrap().iter().map(|e| e["bursts"].as_array().unwrap().len()).collect();
     assert_eq!(found, [2, 2], "{report}");

@@ -1,7 +1,8 @@
 //! Light curves and dynamic spectra of bursts.
 
 use std::fmt::Write;
-use std::path::Path;
+use std::fs;
+use std::path::{Path, PathBuf};
 
 use super::error::{ProductsError, write_product};
 use super::pictures::{Axis, ColourScale, Palette, Raster, Scaling, draw_rasters};
@@ -16,9 +17,10 @@ const COLUMNS: usize = 512;
 /// Files that cannot be written.
 pub fn write_event(out: &Path, number: usize, event: &BurstEvent) -> Result<(), ProductsError> {
     if event.curves.iter().all(|curve| curve.points.is_empty()) {
+        remove_event(out, number);
         return Ok(());
     }
-    let path = |ending: &str| out.join(format!("event-{number:04}.{ending}"));
+    let path = |ending: &str| event_file(out, number, ending);
     write_product(&path("csv"), csv(event))?;
     let from_s = event.from_s;
     let title = format!("Event {number}, from {from_s:.0} s");
@@ -32,7 +34,7 @@ pub fn write_event(out: &Path, number: usize, event: &BurstEvent) -> Result<(), 
             ..Axis::default()
         },
         y: Axis {
-            label: format!("channel, {}", band(event)),
+            label: format!("channels with data, {}", band(event)),
             limits: Some((-0.5, rows as f64 - 0.5)),
             ..Axis::default()
         },
@@ -42,6 +44,17 @@ pub fn write_event(out: &Path, number: usize, event: &BurstEvent) -> Result<(), 
         unit: "Jy".to_owned(),
     };
     Ok(draw_rasters(&title, &[raster], 1)?.write(&path("png"))?)
+}
+
+fn event_file(out: &Path, number: usize, ending: &str) -> PathBuf {
+    out.join(format!("event-{number:04}.{ending}"))
+}
+
+/// Removes the files of an event of an earlier command.
+pub fn remove_event(out: &Path, number: usize) {
+    for ending in ["csv", "png"] {
+        let _ = fs::remove_file(event_file(out, number, ending));
+    }
 }
 
 fn band(event: &BurstEvent) -> String {

@@ -37,7 +37,7 @@ pub use autos::{AutoSummary, summarise, write_autos};
 #[doc(hidden)]
 pub use beam::EffectiveBeam;
 #[doc(hidden)]
-pub use burst_events::write_event;
+pub use burst_events::{remove_event, write_event};
 #[doc(hidden)]
 pub use comparison_pictures::{draw_comparison, draw_relative_error};
 #[doc(hidden)]

@@ -10,7 +10,7 @@ use crate::ground::{WAIT_BYTES, read_passes};
 use crate::pipeline::config::{Config, PipelineError};
 use crate::pipeline::graph::calibrate_products::write_json;
 use crate::pipeline::graph::run::lock_folder;
-use crate::products::{create_folder, write_event};
+use crate::products::{create_folder, remove_event, write_event};
 use crate::runtime::{Ledger, LedgerReport};
 
 /// What was found in downlink files.
@@ -48,6 +48,7 @@ pub fn bursts_of_downlink(
 ) -> Result<BurstsReport, PipelineError> {
     create_folder(out)?;
     let _lock = lock_folder(out)?;
+    let earlier = events_of(&out.join("summary.json"));
     let ledger = Ledger::new();
     let (mut events, mut failure) = (Vec::new(), None);
     let mut write = |event: BurstEvent| {
@@ -69,7 +70,14 @@ pub fn bursts_of_downlink(
     if let Some(error) = failure {
         return Err(error.into());
     }
+    (events.len() + 1..=earlier).for_each(|number| remove_event(out, number));
     let report = BurstsReport { ledger: ledger.balanced_report()?, events };
     write_json(&out.join("summary.json"), &report)?;
     Ok(report)
+}
+
+/// Number of events of an earlier command in this folder; 0 if there is none.
+fn events_of(summary: &Path) -> usize {
+    let read = || serde_json::from_slice::<serde_json::Value>(&std::fs::read(summary).ok()?).ok();
+    read().and_then(|summary| Some(summary.get("events")?.as_array()?.len())).unwrap_or(0)
 }
