@@ -245,15 +245,17 @@ fn nobody_reads_and_nothing_panics() {
 
 #[test]
 fn interrupted_samples_leave_the_state_and_say_so() {
-    let place = Workplace::new(&SMALL.replace("epsilon = 1e-4", "").replace("engine = 'pixel'", ""));
-    let file = place.simulate("all.ccsds", &[]);
+    let finer =
+        SMALL.replace("epsilon = 1e-4", "").replace("engine = 'pixel'", "").replace("nside = 4", "nside = 8");
+    let place = Workplace::new(&finer);
+    let file = place.simulate("all.ccsds", &["--set", "spacecraft.channels_hz=[3.0e6]"]);
     let (state, maps, out) = (place.path("state"), place.path("maps"), place.path("samples"));
     succeed(&["replay", &file, "--map", &place.pipeline, "--state", &state, "--out", &maps]);
     let before = files(Path::new(&state));
-    // Hours.
+    // Minutes.
     let mut child = start(&["sample", &state, "--count", "10000", "--gibbs", "--out", &out]);
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(|line| line.unwrap());
-    // The first line of progress comes after seconds.
+    // The first line of progress comes after ten seconds.
     assert!(lines.any(|line| line.contains("of 10000")), "it has ended by itself");
     signal(&child, "INT");
     let (status, took) = end(&mut child);

@@ -221,6 +221,44 @@ fn gaps_are_told_in_packets_and_in_integration_time() {
 }
 
 #[test]
+fn visibilities_without_positions_are_told_as_lost() {
+    let place = Ground::new();
+    let file = place.downlink();
+    let all = packets(&file);
+    let positions: Vec<u64> = all
+        .iter()
+        .map(|packet| identity(packet))
+        .filter(|(apid, _)| *apid == POSITIONS)
+        .map(|(_, count)| count)
+        .collect();
+    let middle = positions[positions.len() / 3]..positions[2 * positions.len() / 3];
+    let is_kept = |packet: &&Vec<u8>| {
+        let (apid, count) = identity(packet);
+        apid != POSITIONS || !middle.contains(&count)
+    };
+    let kept: Vec<u8> = all.iter().filter(is_kept).flatten().copied().collect();
+    let lacking = place.file("lacking.ccsds", &kept);
+    let (whole, found) = (json(&["gaps", &file]), json(&["gaps", &lacking]));
+    // All visibilities have come.
+    assert_eq!(total(&found, "integration_s"), total(&whole, "integration_s"));
+    assert_eq!(total(&found, "missing_weight"), 0.0);
+    // The weights of the same file with positions are those that lack without.
+    let [before, after, waiting] =
+        [total(&whole, "weight"), total(&found, "weight"), total(&found, "waiting_weight")];
+    // They are sums of equal numbers in another order.
+    assert!(before - after > 0.1 * before && ((before - after) / waiting - 1.0).abs() < 1e-9);
+    assert!(total(&found, "waiting_integration_s") > 0.1 * total(&found, "integration_s"));
+    let table = succeed(&["gaps", &lacking]);
+    for (of_whole, of_found) in
+        whole["channels"].as_array().unwrap().iter().zip(found["channels"].as_array().unwrap())
+    {
+        let [before, after] = [of_whole, of_found].map(|channel| channel["weight"].as_f64().unwrap());
+        let percent = format!("{:.3} %", 100.0 * (1.0 - after / before));
+        assert!(table.contains(&percent), "{percent}: {table}");
+    }
+}
+
+#[test]
 fn a_state_of_other_settings_is_refused() {
     let place = Ground::new();
     let file = place.downlink();

@@ -58,6 +58,7 @@ def read(folder):
         found = hp.read_map(str(file))
         expected = values.astype(found.dtype)
         assert np.array_equal(found, expected), file
+        assert header["CREATOR"].startswith("lunarray "), file
         assert header["PIXTYPE"] == "HEALPIX" and header["NSIDE"] == nside, file
         assert header["COORDSYS"] in "GEC" and header["TUNIT1" if header["TFIELDS"] == 1 else "TUNIT2"] == "K", file
         # healpy's own file of the same map differs in no card and no byte.
@@ -67,7 +68,7 @@ def read(folder):
         given = hp.reorder(expected, r2n=True) if nest else expected
         hp.write_map(str(own), given, nest=nest, coord=header["COORDSYS"], partial=partial, column_units="K",
                      column_names=["TEMPERATURE"], dtype=found.dtype, overwrite=True,
-                     extra_header=[("SEED", 17, "seed"), ("FREQ", 1e7, "Hz")])
+                     extra_header=[("CREATOR", header["CREATOR"], "program"), ("SEED", 17, "seed"), ("FREQ", 1e7, "Hz")])
         assert own.read_bytes() == file.read_bytes(), file
     print(len(files))
 

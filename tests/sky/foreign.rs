@@ -14,7 +14,7 @@ name = "foreign"
 [spacecraft]
 channels_hz = [10.0e6]
 every_nth_window = 300
-baseline_wavelengths_max = 1.0
+baseline_wavelengths_max = 16.0
 [products]
 pictures = false
 "#;

@@ -91,17 +91,21 @@ fn fail_if(text: &str) -> Result<FailIf, String> {
 fn table(gaps: &Gaps, gaps_max: usize) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
-    let _ = writeln!(text, "channel        MHz     packets  received, h  missing, h  missing weight");
+    let _ = writeln!(
+        text,
+        "channel        MHz     packets  received, h  missing, h  without positions, h  weight lost"
+    );
     for channel in &gaps.channels {
-        let all = channel.weight + channel.missing_weight;
-        let missing_percent = if all > 0.0 { 100.0 * channel.missing_weight / all } else { 0.0 };
-        let (received_h, missing_h) =
-            (channel.integration_s / 3600.0, channel.missing_integration_s / 3600.0);
+        let lost = channel.missing_weight + channel.waiting_weight;
+        let lost_percent = if lost > 0.0 { 100.0 * lost / (channel.weight + lost) } else { 0.0 };
+        let [received_h, missing_h, waiting_h] =
+            [channel.integration_s, channel.missing_integration_s, channel.waiting_integration_s]
+                .map(|time_s| time_s / 3600.0);
         let (number, packets) = (channel.channel, channel.packets);
         let mhz = channel.frequency_hz.map_or("?".to_owned(), |hz| format!("{:.4}", hz / 1e6));
         let _ = writeln!(
             text,
-            "{number:<7} {mhz:>10} {packets:>11} {received_h:>12.2} {missing_h:>11.2} {missing_percent:>13.3} %"
+            "{number:<7} {mhz:>10} {packets:>11} {received_h:>12.2} {missing_h:>11.2} {waiting_h:>21.2} {lost_percent:>10.3} %"
         );
     }
     if !gaps.restarts.is_empty() {

@@ -23,7 +23,8 @@ use crate::units::ChannelId;
 
 /// Interval of refreshes on a terminal, and of checks for cancellation.
 const POLL: Duration = Duration::from_millis(200);
-const LINE_EVERY: Duration = Duration::from_secs(10);
+/// Interval of lines of progress.
+pub(super) const LINE_EVERY: Duration = Duration::from_secs(10);
 
 /// Interval between lines of the propagation of orbits.
 const PROPAGATION_EVERY: Duration = Duration::from_secs(3);

@@ -1,7 +1,7 @@
 //! `lunarray sample`: maps of a state's sums that are as likely as its map.
 
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use serde::Serialize;
@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::arguments::{StateMapArgs, output_path};
 use super::interrupt::Interrupt;
 use super::output::{CommandError, CommandResult, print_json_line, print_notes, print_text};
-use super::progress::while_solving;
+use super::progress::{LINE_EVERY, while_solving};
 use crate::files::write_atomically;
 use crate::imaging::{RegulariserChoice, Sample, Samples, Solution, SolveError, SolveWatch};
 use crate::pipeline::{PipelineError, sample_state, use_threads};
@@ -159,7 +159,12 @@ fn write(
         .map_err(Box::<dyn std::error::Error + Send + Sync>::from)
     };
     save("map.fits", &solution.map_k)?;
+    let mut said = Instant::now();
     for (number, sample) in errors.samples.iter().enumerate() {
+        if said.elapsed() >= LINE_EVERY {
+            said = Instant::now();
+            print_notes([format!("writing sample {} of {}", number + 1, errors.samples.len())]);
+        }
         save(&format!("sample-{:04}.fits", number + 1), &sample.map_k)?;
     }
     let pixels = solution.map_k.len() as f64;

@@ -260,12 +260,16 @@ fn unclear_step(before: &PassSolution, solution: &PassSolution) -> Option<Instru
     }
     // Phases relative to one daughter, that of the part before.
     let common = &solution.daughters.get((before.reference as usize).checked_sub(1)?)?.gains;
+    // A weak signal has an event of its own, and its gains are guesses.
+    let is_weak = |channel: usize| {
+        [before, solution].iter().any(|of| of.models.get(channel) == Some(&ModelVerdict::Weak))
+    };
     let (mut best, mut most) = (None, 0.0);
     for (n, (earlier, later)) in before.daughters.iter().zip(&solution.daughters).enumerate() {
         for (channel, (a, b)) in earlier.gains.iter().zip(&later.gains).enumerate() {
             let is_known = |gain: &GainEstimate| !matches!(gain.state, GainState::NoData | GainState::Dead);
             let reference = &common[channel];
-            if !is_known(a) || !is_known(b) || !is_known(reference) {
+            if is_weak(channel) || !is_known(a) || !is_known(b) || !is_known(reference) {
                 continue;
             }
             let change = wrapped((b.phase_deg - reference.phase_deg - a.phase_deg).to_radians());

@@ -58,10 +58,14 @@ pub struct ChannelCoverage {
     pub integration_s: f64,
     /// Weight in the map, (K sr)^-2.
     pub weight: f64,
-    /// Integration time missing, s.
+    /// Integration time in missing packets, s.
     pub missing_integration_s: f64,
-    /// Weight missing, (K sr)^-2.
+    /// Weight in missing packets, (K sr)^-2.
     pub missing_weight: f64,
+    /// Part of the received integration time whose positions are missing, s.
+    pub waiting_integration_s: f64,
+    /// Weight that it would have in the map, (K sr)^-2.
+    pub waiting_weight: f64,
 }
 
 /// All gaps in the received packets.
@@ -154,15 +158,21 @@ fn coverage(received: &ReceivedPackets) -> BTreeMap<u16, ChannelCoverage> {
             (channel, ChannelCoverage { channel, frequency_hz: Some(hz), ..ChannelCoverage::default() })
         })
         .collect();
-    for VisibilityPacket { entry, is_waiting, share } in
-        received.packets.iter().filter(|packet| !packet.is_auto())
-    {
+    let streams =
+        PacketStreams::new(received.packets.iter().filter(|packet| packet.share.is_some()).copied());
+    for packet in received.packets.iter().filter(|packet| !packet.is_auto()) {
+        let VisibilityPacket { entry, is_waiting, share } = packet;
         let channel = entry.channel.0;
         let new = || ChannelCoverage { channel, ..ChannelCoverage::default() };
         let coverage = channels.entry(channel).or_insert_with(new);
         coverage.packets += 1;
         coverage.integration_s += entry.integration_s;
-        coverage.weight += if *is_waiting { 0.0 } else { entry.weight * share.unwrap_or(1.0) };
+        if *is_waiting {
+            coverage.waiting_integration_s += entry.integration_s;
+            coverage.waiting_weight += entry.weight * streams.share(packet.stream(), entry.sent());
+        } else {
+            coverage.weight += entry.weight * share.unwrap_or(1.0);
+        }
     }
     channels
 }

@@ -206,6 +206,8 @@ impl Posterior<'_> {
             }
             let mut turn = 0;
             let name = format!("sample {} of {count}, with its power", number + 1);
+            // Shown between its solutions, too.
+            let _drawing = self.watch.start(&name, self.rule.residual_max);
             let drawn = self.found.gibbs(number, &mut |r| {
                 turn += 1;
                 self.drawn_with((r, scale), GIBBS + 16 * number + turn, &name)

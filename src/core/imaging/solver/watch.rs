@@ -211,14 +211,15 @@ impl<'a> NamedWatch<'a> {
         state.started += 1;
         let number = state.started;
         let what = format!("{name}: {what}");
-        state.current = Some(Solving { number, what, iteration: 0, residual: 1.0, target, part: None });
-        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled(), inner: None }
+        let solving = Solving { number, what, iteration: 0, residual: 1.0, target, part: None };
+        let before = state.current.replace(solving);
+        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled(), inner: None, before }
     }
 
     /// Starts an inner iteration of the current task, with its own residual `target`.
     pub(in crate::imaging) fn inner(self, what: &'static str, target: f64) -> SolveTask<'a> {
         let was_cancelled = self.watch.cancel.is_cancelled();
-        SolveTask { named: self, watch: self.watch, was_cancelled, inner: Some((what, target)) }
+        SolveTask { named: self, watch: self.watch, was_cancelled, inner: Some((what, target)), before: None }
     }
 }
 
@@ -228,6 +229,8 @@ pub(in crate::imaging) struct SolveTask<'a> {
     was_cancelled: bool,
     /// Description and target residual, for an inner iteration.
     inner: Option<(&'static str, f64)>,
+    /// The task of which it is a step.
+    before: Option<Solving>,
 }
 
 impl SolveTask<'_> {
@@ -283,7 +286,7 @@ impl Drop for SolveTask<'_> {
         let mut state = self.watch.state();
         match (self.inner, &mut state.current) {
             (Some(_), Some(solving)) => solving.part = None,
-            _ => state.current = None,
+            _ => state.current = self.before.take(),
         }
     }
 }
