@@ -74,6 +74,39 @@ fn an_interrupt_ends_a_run_whose_standard_error_nobody_reads() {
 }
 
 #[test]
+fn a_run_without_time_for_its_final_maps_lists_the_others() {
+    let free = "matrix = 'free'\nsnapshot_every_s = 2e6";
+    let place = Workplace::new(&SMALL.replace("epsilon = 1e-4", free).replace("nside = 4", "nside = 8"));
+    let out = PathBuf::from(place.path("out"));
+    let mut child = start(
+        &[
+            &["run", &place.pipeline, "--out", &place.path("out"), "--json"][..],
+            &["--set", "runtime.grace_s=0"],
+        ]
+        .concat(),
+    );
+    wait_until("a map", || {
+        assert!(child.try_wait().unwrap().is_none(), "it has ended by itself");
+        out.join("3.000MHz/latest.fits").exists()
+    });
+    signal(&child, "INT");
+    assert_eq!(end(&mut child).0.code(), Some(130));
+    let summary: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(out.join("summary.json")).unwrap()).unwrap();
+    assert_eq!(summary["channels"].as_array().unwrap().len(), 0);
+    let mut listed: Vec<PathBuf> = summary["intermediate_files"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|file| file.as_str().unwrap().into())
+        .collect();
+    listed.sort();
+    let there =
+        files(&out).into_keys().filter(|name| name.starts_with("3.000MHz") || name.starts_with("10.000MHz"));
+    assert_eq!(listed, there.collect::<Vec<PathBuf>>());
+}
+
+#[test]
 fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
     let place = Workplace::new(SMALL);
     let mut child = Command::new("sh")

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 
 use lunarray::frames::PlacedVisibilities;
 use lunarray::imaging::{MapConfig, Snapshot, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
-use lunarray::products::{ChannelSummary, ProductsConfig, Provenance, Publisher, Truth};
+use lunarray::products::{ChannelSummary, ProductsConfig, Provenance, Publisher, Truth, WrittenProducts};
 use lunarray::runtime::{Cancel, Outlet, Sink, Stage};
 use lunarray::units::ChannelId;
 
@@ -55,17 +55,17 @@ fn cancelled() -> SolveWatch {
 }
 
 fn publish(solution: Solution, folder: &Path) -> (ChannelSummary, BTreeMap<String, Vec<u8>>) {
-    let summaries = Arc::new(Mutex::new(Vec::new()));
+    let written = Arc::new(Mutex::new(WrittenProducts::default()));
     let provenance = Provenance { ground_hash: 0, map: MapConfig::default() };
     let config = ProductsConfig { pictures: false, ..ProductsConfig::default() };
     let mut publisher =
-        Publisher::new(config, folder, Truth::unknown(), provenance, Arc::clone(&summaries)).unwrap();
+        Publisher::new(config, folder, Truth::unknown(), provenance, Arc::clone(&written)).unwrap();
     publisher.take(solution).unwrap();
     publisher.finish().unwrap();
     let files = fs::read_dir(folder.join("3.000MHz")).unwrap().map(|entry| entry.unwrap().path());
     let name = |path: &Path| path.file_name().unwrap().to_string_lossy().into_owned();
     let files = files.map(|path| (name(&path), fs::read(path).unwrap())).collect();
-    let summary = summaries.lock().unwrap().pop().unwrap();
+    let summary = written.lock().unwrap().channels.pop().unwrap();
     (summary, files)
 }
 

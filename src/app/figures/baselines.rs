@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::error::FigureError;
 use super::output::FigureParts;
 use crate::frames::ObservingWindow;
+use crate::mother::WindowThinning;
 use crate::pipeline::Plan;
 use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
 use crate::units::constants::DAY_S;
@@ -20,6 +21,8 @@ const WINDOWS_MAX: usize = 500;
 const SAMPLES: usize = 9;
 /// Maximum number of curves. Only pairs with the first satellite are drawn.
 const CURVES_MAX: usize = 10;
+/// Half of the width of a mark where windows are skipped, as a fraction of the mission.
+const MARK: f64 = 0.002;
 
 #[derive(Serialize)]
 struct BaselineNumbers {
@@ -84,6 +87,32 @@ fn extremes_of(plan: &Plan, pairs: &[Pair], window: ObservingWindow) -> WindowEx
     out
 }
 
+fn table(pairs: &[Pair], windows: &[WindowExtremes]) -> String {
+    let mut csv = "day,i,j,length_m_min,length_m_max,across_m_max,radial_m_max\n".to_owned();
+    for window in windows {
+        for (pair, found) in pairs.iter().zip(&window.pairs) {
+            let [shortest_m, longest_m] = found.length_m;
+            let _ = writeln!(
+                csv,
+                "{:.4},{},{},{shortest_m:.3},{longest_m:.3},{:.3},{:.3}",
+                window.day,
+                pair.i + 1,
+                pair.j + 1,
+                found.across_m,
+                found.radial_m
+            );
+        }
+    }
+    csv
+}
+
+/// A mark at each point, and nothing between them: baselines may turn there several times.
+fn marks(values: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let [Some(first), Some(last)] = [values.first(), values.last()] else { return Vec::new() };
+    let half = MARK * (last.0 - first.0).max(f64::MIN_POSITIVE);
+    values.iter().flat_map(|&(x, y)| [(x - half, y), (x + half, y), (f64::NAN, y)]).collect()
+}
+
 pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     let pairs = all_pairs(plan.array.satellites());
     let step = plan.windows.len().div_ceil(WINDOWS_MAX).max(1);
@@ -108,26 +137,14 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
             maximum(&mut windows.iter().map(|window| window.altitude_m[1])),
         ],
     };
-    let mut csv = "day,i,j,length_m_min,length_m_max,across_m_max,radial_m_max\n".to_owned();
-    for window in &windows {
-        for (pair, found) in pairs.iter().zip(&window.pairs) {
-            let [shortest_m, longest_m] = found.length_m;
-            let _ = writeln!(
-                csv,
-                "{:.4},{},{},{shortest_m:.3},{longest_m:.3},{:.3},{:.3}",
-                window.day,
-                pair.i + 1,
-                pair.j + 1,
-                found.across_m,
-                found.radial_m
-            );
-        }
-    }
+    let are_skipped = step > 1 || plan.config.spacecraft.window_thinning() != WindowThinning::EveryNth(1);
+    let line = |values: Vec<(f64, f64)>| if are_skipped { marks(&values) } else { values };
     // Positions are exact to less than a millimetre; what is smaller is rounding.
     let whole_mm = |value_m: f64| (value_m * 1e3).round() / 1e3;
     let shown = || pairs.iter().enumerate().filter(|(_, pair)| pair.i == 0).take(CURVES_MAX);
     let curves = |value: &dyn Fn(&Extremes) -> f64| -> Vec<Curve> {
-        let points = |k: usize| windows.iter().map(|window| (window.day, value(&window.pairs[k]))).collect();
+        let points =
+            |k: usize| line(windows.iter().map(|window| (window.day, value(&window.pairs[k]))).collect());
         let curve = |(k, pair): (usize, &Pair)| Curve {
             label: format!("{}-{}", pair.i + 1, pair.j + 1),
             points: points(k),
@@ -137,7 +154,7 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     };
     let altitude = |index: usize, label: &str| Curve {
         label: label.to_owned(),
-        points: windows.iter().map(|window| (window.day, window.altitude_m[index] / 1e3)).collect(),
+        points: line(windows.iter().map(|window| (window.day, window.altitude_m[index] / 1e3)).collect()),
         dashed: index == 0,
     };
     let day = || Axis { label: "day".to_owned(), ..Axis::default() };
@@ -165,5 +182,22 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     ];
     let title = format!("Baselines of {} satellites, {} windows", plan.array.satellites(), windows.len());
     let picture = draw_plots(&title, &plots, 2)?;
-    Ok(FigureParts::new(&numbers, csv, picture))
+    Ok(FigureParts::new(&numbers, table(&pairs, &windows), picture))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_joins_windows_between_which_others_were_skipped() {
+        let drawn = marks(&[(0.0, 1.0), (100.0, 7.0)]);
+        let pieces: Vec<&[(f64, f64)]> =
+            drawn.split(|(x, _)| x.is_nan()).filter(|line| !line.is_empty()).collect();
+        assert_eq!(pieces.len(), 2);
+        for (piece, (x, y)) in pieces.iter().zip([(0.0, 1.0), (100.0, 7.0)]) {
+            assert!(piece.iter().all(|point| (point.0 - x).abs() < 1.0 && point.1 == y), "{piece:?}");
+        }
+        assert_eq!(marks(&[]), []);
+    }
 }

@@ -208,8 +208,13 @@ impl ChannelFolder {
     }
 
     /// The summary; `None` if there was no final map.
-    pub(super) fn into_summary(self) -> Option<ChannelSummary> {
-        self.summary.map(|summary| ChannelSummary { files: self.files, ..summary })
+    pub(super) fn summary(&self) -> Option<ChannelSummary> {
+        self.summary.clone().map(|summary| ChannelSummary { files: self.files.clone(), ..summary })
+    }
+
+    /// The files that it has written, relative to the folder of all channels.
+    pub(super) fn files(&self) -> &[String] {
+        &self.files
     }
 
     fn record_snapshot(&mut self, solution: &Solution, shown: &ShownMaps, comparison: Option<&Comparison>) {

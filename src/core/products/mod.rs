@@ -63,7 +63,7 @@ pub use point_beams::{BeamWidths, PointBeamSummary};
 #[doc(hidden)]
 pub use provenance::Provenance;
 #[doc(hidden)]
-pub use publisher::{ProductsReport, ProductsWatch, Publisher};
+pub use publisher::{ProductsReport, ProductsWatch, Publisher, WrittenProducts};
 #[doc(hidden)]
 pub use run_pictures::draw_runs;
 #[doc(hidden)]

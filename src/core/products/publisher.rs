@@ -25,13 +25,22 @@ pub struct Publisher {
     truth: Truth,
     provenance: Provenance,
     channels: BTreeMap<ChannelId, ChannelFolder>,
-    summaries: Arc<Mutex<Vec<ChannelSummary>>>,
+    written: Arc<Mutex<WrittenProducts>>,
     published: u64,
     viewers: MapWatch,
     /// Report on failures, if these do not end the run.
     watch: Option<ProductsWatch>,
     /// The last map of each channel whose files could not be written.
     unwritten: BTreeMap<ChannelId, Solution>,
+}
+
+/// What a publisher has written so far.
+#[derive(Clone, Debug, Default)]
+pub struct WrittenProducts {
+    /// Summaries of the channels with a final map.
+    pub channels: Vec<ChannelSummary>,
+    /// Files of the other channels, relative to the folder.
+    pub intermediate_files: Vec<String>,
 }
 
 const RETRY_AFTER: Duration = Duration::from_secs(5);
@@ -67,8 +76,8 @@ impl ProductsWatch {
 }
 
 impl Publisher {
-    /// A publisher that writes into `folder`, which it creates if needed. At the end it stores the summaries of all
-    /// channels in `summaries`.
+    /// A publisher that writes into `folder`, which it creates if needed. After each map it lists in `written` what there is, as a run that is
+    /// ended early may leave no time for more.
     ///
     /// # Errors
     /// A folder that cannot be created.
@@ -77,7 +86,7 @@ impl Publisher {
         folder: &Path,
         truth: Truth,
         provenance: Provenance,
-        summaries: Arc<Mutex<Vec<ChannelSummary>>>,
+        written: Arc<Mutex<WrittenProducts>>,
     ) -> Result<Self, ProductsError> {
         create_folder(folder)?;
         let (folder, viewers) = (folder.to_owned(), MapWatch::default());
@@ -87,7 +96,7 @@ impl Publisher {
             truth,
             provenance,
             channels: BTreeMap::new(),
-            summaries,
+            written,
             published: 0,
             viewers,
             watch: None,
@@ -119,7 +128,20 @@ impl Publisher {
             folder.publish(solution, &self.provenance, viewers)?;
             self.published += 1;
         }
+        self.list();
         Ok(())
+    }
+
+    fn list(&self) {
+        let (mut channels, mut intermediate_files) = (Vec::new(), Vec::new());
+        for folder in self.channels.values() {
+            match folder.summary() {
+                Some(summary) => channels.push(summary),
+                None => intermediate_files.extend_from_slice(folder.files()),
+            }
+        }
+        let written = WrittenProducts { channels, intermediate_files };
+        *self.written.lock().unwrap_or_else(PoisonError::into_inner) = written;
     }
 
     fn retry_unwritten(&mut self) -> Result<(), ProductsError> {
@@ -163,11 +185,7 @@ impl Sink for Publisher {
                 break;
             }
         }
-        last?;
-        let channels = std::mem::take(&mut self.channels).into_values();
-        let finished: Vec<ChannelSummary> = channels.filter_map(ChannelFolder::into_summary).collect();
-        *self.summaries.lock().unwrap_or_else(PoisonError::into_inner) = finished;
-        Ok(())
+        last
     }
 
     fn retry_after(&self) -> Option<Duration> {

@@ -14,7 +14,7 @@ use crate::downlink::transport::socket::Listening;
 use crate::frames::AutoPower;
 use crate::imaging::{KeptSums, SolveWatch};
 use crate::pipeline::config::{Config, PipelineError, Plan};
-use crate::products::write_autos;
+use crate::products::{WrittenProducts, write_autos};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Report};
 use crate::units::vector::Vec3;
@@ -122,9 +122,10 @@ pub(in crate::pipeline) fn collect_summary(
     finished: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
     let FinishedGraph { report, outcome, listening, samples, .. } = finished;
-    let SegmentOutcome { ground, channels } = outcome;
+    let SegmentOutcome { ground, written } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let WrittenProducts { channels, intermediate_files } =
+        written.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = ground.ledger.balanced_report()?;
     let listening = listening.map(|listening| listening.report());
     if let Some(report) = &listening {
@@ -133,6 +134,7 @@ pub(in crate::pipeline) fn collect_summary(
     let mut autos = ground.autos.lock().unwrap_or_else(PoisonError::into_inner);
     write_autos(&mut autos, out, config.products.pictures)?;
     let mut summary = RunSummary::new(segment, config, report, ledger, reception, channels);
+    summary.intermediate_files = intermediate_files;
     (summary.listening, summary.samples) = (listening, samples);
     summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
     summary.saving = ground.saving.report();

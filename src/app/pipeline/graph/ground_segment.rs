@@ -13,7 +13,7 @@ use crate::imaging::{
 };
 use crate::pipeline::config::{Config, PipelineError};
 use crate::products::{
-    ChannelSummary, MapShape, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth,
+    MapShape, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth, WrittenProducts,
 };
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::read_prior;
@@ -84,7 +84,7 @@ impl Config {
 #[derive(Clone, Debug)]
 pub(in crate::pipeline) struct SegmentOutcome {
     pub(in crate::pipeline) ground: GroundOutcome,
-    pub(in crate::pipeline) channels: Arc<Mutex<Vec<ChannelSummary>>>,
+    pub(in crate::pipeline) written: Arc<Mutex<WrittenProducts>>,
 }
 
 /// Destination, input sky and handles for the maps of the ground segment.
@@ -111,7 +111,7 @@ pub(in crate::pipeline) fn add(
     mapping: MappingContext<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
     let MappingContext { out, truth, watch, viewers, product_state, kept } = mapping;
-    let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
+    let outcome = SegmentOutcome { ground: ground.outcome(), written: Arc::default() };
     let ranks = ground.ranks().clone();
     let iteration_folder = config.map.refine.is_on().then(|| out.to_owned());
     let setup = SolverSetup { iteration_folder, kept, ..config.solver(watch.with_ranks(&ranks))? };
@@ -122,9 +122,9 @@ pub(in crate::pipeline) fn add(
         return Ok(outcome);
     }
     let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
-    let channels = Arc::clone(&outcome.channels);
+    let written = Arc::clone(&outcome.written);
     let publisher =
-        Publisher::new(config.products.clone(), out, truth, provenance, channels)?.with_viewers(viewers);
+        Publisher::new(config.products.clone(), out, truth, provenance, written)?.with_viewers(viewers);
     let publisher = product_state.iter().fold(publisher, Publisher::with_retries);
     let mut writer = GainsWriter::new(config, out);
     let ground = ground.with_observer(Box::new(move |gains| writer.update(gains)));

@@ -49,6 +49,9 @@ pub struct RunSummary {
     pub ground_hash: String,
     /// The maps, channel by channel.
     pub channels: Vec<ChannelSummary>,
+    /// Files of channels whose final map was not made, as the run was ended early.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub intermediate_files: Vec<String>,
     /// The ledger of visibilities.
     pub ledger: LedgerReport<VisibilityReason>,
     /// Whether the ledger is known to be complete.
@@ -100,6 +103,7 @@ impl RunSummary {
             space_hash: channels.first().map(|channel| channel.space_hash.clone()),
             ground_hash: format!("{:016x}", config.ground_hash()),
             channels,
+            intermediate_files: Vec::new(),
             ledger,
             completeness: Completeness::default(),
             samples: None,
@@ -261,6 +265,7 @@ fn product_files(summary: &[u8]) -> Vec<String> {
     #[serde(default)]
     struct Summary {
         channels: Vec<Channel>,
+        intermediate_files: Vec<String>,
         joint: Option<Joint>,
     }
     #[derive(Default, Deserialize)]
@@ -293,7 +298,8 @@ fn product_files(summary: &[u8]) -> Vec<String> {
     let maps = summary.joint.into_iter().flat_map(|joint| joint.maps).flat_map(of_joint);
     let maps = maps.filter(is_product).map(|file| format!("{JOINT}/{file}"));
     let others = ["spectra.fits", "joint.json"].into_iter().filter(|_| has_joint);
-    let of_channels = summary.channels.into_iter().flat_map(|channel| channel.files).filter(is_product);
+    let final_files = summary.channels.into_iter().flat_map(|channel| channel.files);
+    let of_channels = final_files.chain(summary.intermediate_files).filter(is_product);
     of_channels.chain(maps).chain(others.map(|name| format!("{JOINT}/{name}"))).collect()
 }
 
@@ -330,6 +336,9 @@ impl fmt::Display for RunSummary {
                 f,
                 "Ended early: runtime.grace_s left no time for all maps. Maps of channels that are not listed are missing or without all products; earlier ones are kept."
             )?;
+            if !self.intermediate_files.is_empty() {
+                write!(f, " Of these there is: {}", self.intermediate_files.join(", "))?;
+            }
         } else if self.cancelled && !self.report.cancelled {
             write!(f, "Ended early, without joint maps: all other products are complete.")?;
         } else if self.cancelled {
