@@ -140,7 +140,7 @@ def write_downlink(path: str | PathLike[str], instrument: Instrument, parts: lis
 
 
 def _require_once(rows, channels):
-    """Requires that no visibility is there twice, of rows in the order of the file."""
+    """Requires that no visibility is there twice, and that integrations do not overlap, of rows in the order of the file."""
     same = np.all([np.diff(rows[name]) == 0 for name in ("channel", "i", "j")], axis=0)
     # In half ticks. Julian dates tell times to 40 us.
     middle = 2 * rows["time"] + rows["duration"]
@@ -151,6 +151,13 @@ def _require_once(rows, channels):
             f"the visibility of antennas {rows['i'][k] + 1} and {rows['j'][k] + 1} (in the order of their numbers) at t = "
             f"{middle[k] * 5e-7} s and {channels[rows['channel'][k], 0]} Hz is there twice: expected each once; UVData.__add__ joins "
             "polarisations of two files in one object"
+        )
+    # Some may overlap; most do if times and integration times have different units.
+    apart, long = np.diff(middle)[same], 2.0 * rows["duration"][1:][same]
+    if len(apart) and np.median(long / apart) > 2:
+        raise Error(
+            f"integrations of {np.median(long) * 5e-7:g} s begin every {np.median(apart) * 5e-7:g} s: expected integrations of a pair that "
+            "do not overlap, and integration times and times both in seconds"
         )
 
 

@@ -70,10 +70,12 @@ def from_table(
     if (antennas != np.rint(antennas)).any() or antennas.min() < 1 or antennas.max() > 255:
         raise Error(f"{path}: antennas from {antennas.min():g} to {antennas.max():g}: expected whole numbers from 1")
     first, second = antennas.astype(int) - 1
-    value = columns[f"re_{units[0]}"] + 1j * columns[f"im_{units[0]}"]
-    value = value if units[0] == "k_sr" else value / jansky_per_k_sr(each_hz)
+    value = _values(path, columns, units, jansky_per_k_sr(each_hz))
     weight = columns["weight"] if "weight" in columns else galactic_noise_k_sr(each_hz, width, columns["dt_s"]) ** -2.0
     flagged = columns["flag"] != 0 if "flag" in columns else np.zeros(count, bool)
+    bad = ~flagged & ~(np.isfinite(value) & np.isfinite(weight) & (weight > 0))
+    if bad.any():
+        warnings.warn(f"{path}: {bad.sum()} of {count} rows have no finite value or no positive weight, and are flagged", stacklevel=2)
     baseline_m = -np.stack([columns[name] for name in BASELINES], axis=1) if set(BASELINES) <= set(columns) else None
     parts = []
     for channel_hz in np.unique(each_hz):
@@ -121,6 +123,24 @@ def _with_places(path, columns):
         lost = np.count_nonzero(~known)
         warnings.warn(f"{path}: {lost} of {len(known)} rows have no finite {', '.join(names)}, and are left out", stacklevel=3)
     return {name: column[known] for name, column in columns.items()}
+
+
+def _values(path, columns, units, jansky_per_k_sr):
+    """Visibilities, K sr; where they are in Jy, too, both have to agree."""
+    found = {unit: columns[f"re_{unit}"] + 1j * columns[f"im_{unit}"] for unit in units}
+    if "jy" in found:
+        found["jy"] = found["jy"] / jansky_per_k_sr
+    if len(found) == 2:
+        value, other = found["k_sr"], found["jy"]
+        # Single precision, and the constants of other programs.
+        differs = np.abs(value - other) > 1e-4 * np.maximum(np.abs(value), np.abs(other))
+        if differs.any():
+            k = int(np.argmax(differs))
+            raise Error(
+                f"{path}: row {k + 1} with finite positions has {value[k]:.6g} K sr and {other[k]:.6g} K sr in Jy: expected equal visibilities "
+                "in re_k_sr, im_k_sr and re_jy, im_jy, or one of the two pairs of columns"
+            )
+    return found[units[0]]
 
 
 def _times(path, columns, epoch_tai_s):

@@ -308,6 +308,33 @@ def test_tables_with_a_mark_or_text_are_read_and_kilometres_and_repetitions_refu
         lunarray.from_table(tmp_path / "t.csv", tmp_path / "v", frequency_hz=1e7)
 
 
+def test_values_in_two_units_agree_weights_are_positive_and_integrations_do_not_overlap(tmp_path):
+    rows = rows_of(20.0 * np.arange(10))
+    # 2 k nu^2 / c^2 at 10 MHz, Jy by K sr.
+    jansky = 2 * 1.380649e-23 * (1e7 / 299792458) ** 2 / 1e-26
+    columns = (*COLUMNS, "re_jy", "im_jy", "weight")
+    table = np.concatenate([rows, rows[:, 10:12] * jansky, np.ones((len(rows), 1))], axis=1)
+
+    def read():
+        write_csv(tmp_path / "t.csv", table, columns)
+        return lunarray.from_table(tmp_path / "t.csv", tmp_path / "v", frequency_hz=1e7).visibilities(0)
+
+    assert not read()["flag"].any()
+    table[3, -1], table[4, -1], table[5, 10] = np.nan, -1, np.inf
+    with pytest.warns(UserWarning, match="3 of 30 rows have no finite value or no positive weight, and are flagged"):
+        assert np.count_nonzero(read()["flag"]) == 3
+    table[3:6] = table[6]
+    table[3:6, :4] = rows[3:6, :4]
+    table[3:6, 4:10] = rows[3:6, 4:10]
+    table[7, 13] *= 1.01
+    with pytest.raises(lunarray.Error, match="row 8 with finite positions has 1.* K sr and 1.01.* K sr in Jy"):
+        read()
+    table[7, 13] /= 1.01
+    table[:, 1] *= 1e3
+    with pytest.raises(lunarray.Error, match="integrations of 4294 s begin every 20 s"):
+        read()
+
+
 def test_baselines_of_one_integration_belong_together_to_a_microsecond(tmp_path):
     """Alone, each pair's baseline would be that of antennas as far on both sides of the middle."""
     rows = rows_of(20.0 * np.arange(100))
