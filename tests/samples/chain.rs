@@ -108,7 +108,7 @@ fn the_harmonic_model_is_refused_for_samples_with_a_remedy() {
         ("spacecraft.model=auto", false),
     ] {
         let mut command = assert_cmd::Command::cargo_bin("lunarray").unwrap();
-        let short = ["--set", "spacecraft.duration_s=1e4", "--set", "sky.nside=4", "--set", "map.nside=4"];
+        let short = ["--set", "spacecraft.duration_s=1e4", "--set", "sky.nside=4", "--set", "map.nside=16"];
         command.args(["check", pipeline.to_str().unwrap(), "--set", set]).args(short);
         let done = command.output().unwrap();
         let said = String::from_utf8_lossy(&done.stderr).replace('\n', " ");
