@@ -259,6 +259,36 @@ fn visibilities_without_positions_are_told_as_lost() {
 }
 
 #[test]
+fn positions_lost_at_an_end_are_told_by_every_command() {
+    let place = Ground::new();
+    let file = place.downlink();
+    assert!(succeed(&["inspect", &file]).contains("\nsound:"));
+    let all = packets(&file);
+    let is_position = |packet: &&Vec<u8>| identity(packet).0 == POSITIONS;
+    let positions = all.iter().filter(is_position).count();
+    for (name, lost) in [("first", 0..2), ("last", positions - 2..positions), ("all", 0..positions)] {
+        let mut number = 0..;
+        let kept: Vec<u8> = (all.iter())
+            .filter(|packet| !is_position(packet) || !lost.contains(&number.next().unwrap()))
+            .flatten()
+            .copied()
+            .collect();
+        let lacking = place.file(name, &kept);
+        let table = succeed(&["gaps", &lacking]);
+        assert_eq!(table.contains("none has come"), name != "first", "{table}");
+        for limit in ["any", "0", "1"] {
+            assert_eq!(
+                lunarray(&["gaps", &lacking, "--fail-if", limit]).status.code(),
+                Some(1),
+                "{name} {limit}"
+            );
+        }
+        let told = succeed(&["inspect", &lacking]);
+        assert!(told.contains("not sound: ") && !told.contains("\nsound:"), "{name}: {told}");
+    }
+}
+
+#[test]
 fn a_state_of_other_settings_is_refused() {
     let place = Ground::new();
     let file = place.downlink();

@@ -18,7 +18,7 @@ const RANGES_BYTES_MAX: u64 = 1 << 24;
 /// Cut the packets of given counts out of downlink files.
 ///
 /// For a station that is asked to send missing packets again: ranges are lines of APID, first and last count, as *copy ranges* on the page
-/// copies them and `lunarray gaps` lists them. Writes each intact packet of the files that is in a range, once, as CCSDS packets, which
+/// copies them; `lunarray gaps` has them in its first columns. Writes each intact packet of the files that is in a range, once, as CCSDS packets, which
 /// `lunarray replay` and a listening ground take.
 ///
 /// Example: lunarray extract pass-*.cadu --ranges ranges.txt --out again.ccsds

@@ -9,7 +9,7 @@ use super::arguments::{input_path, picture_path};
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::downlink::PacketKind;
 use crate::files::ProtectedInputs;
-use crate::ground::archive::{CoverageSurvey, GapReport, Gaps, RestartReport};
+use crate::ground::archive::{ChannelCoverage, CoverageSurvey, GapReport, Gaps, RestartReport};
 use crate::products::draw_coverage;
 
 /// List missing packets, and what they would add to the map.
@@ -55,20 +55,37 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
         print_text(table(&gaps, args.most).trim_end())?;
     }
     let packets: u64 = gaps.gaps.iter().map(|gap| gap.to - gap.from + 1).sum();
-    let adds = 100.0 * gaps.gaps.iter().map(|gap| gap.gain).sum::<f64>();
+    let waiting_h = waiting_h(&gaps);
+    // Positions after the last ones received are in no gap.
+    let adds = 100.0 * gaps.gaps.iter().map(|gap| gap.gain).sum::<f64>().max(lost_fraction(&gaps));
     let lacks_data =
-        gaps.gaps.iter().any(|gap| matches!(gap.kind, PacketKind::Visibilities | PacketKind::Ephemeris));
+        gaps.gaps.iter().any(|gap| matches!(gap.kind, PacketKind::Visibilities | PacketKind::Ephemeris))
+            || waiting_h > 0.0;
     match args.fail_if {
-        Some(FailIf::Any) if packets > 0 => {
-            Err(format!("{packets} packets are missing; expected none").into())
-        }
+        Some(FailIf::Any) if packets > 0 || waiting_h > 0.0 => Err(format!(
+            "{packets} packets are missing, and {waiting_h:.3} h of visibilities have no positions; expected none"
+        )
+        .into()),
         // The gain is an estimate: with a limit of 0, any missing data fail even if their gain is 0.
         Some(FailIf::Above(limit)) if adds > limit || (limit == 0.0 && lacks_data) => {
-            Err(format!("the {packets} missing packets would add {adds:.4} %; expected at most {limit} %")
-                .into())
+            Err(format!("what is missing would add {adds:.4} %; expected at most {limit} %").into())
         }
         _ => Ok(Completion::Done),
     }
+}
+
+/// Integration time received without positions, hours.
+fn waiting_h(gaps: &Gaps) -> f64 {
+    gaps.channels.iter().map(|channel| channel.waiting_integration_s).sum::<f64>() / 3600.0
+}
+
+/// What is missing or has no positions, relative to the weight in the map, averaged over channels.
+fn lost_fraction(gaps: &Gaps) -> f64 {
+    let of_channel = |channel: &ChannelCoverage| {
+        let lost = channel.missing_weight + channel.waiting_weight;
+        if channel.weight > 0.0 { lost / channel.weight } else { f64::from(u8::from(lost > 0.0)) }
+    };
+    gaps.channels.iter().map(of_channel).sum::<f64>() / gaps.channels.len().max(1) as f64
 }
 
 /// Condition under which the command fails.
@@ -115,6 +132,14 @@ fn table(gaps: &Gaps, gaps_max: usize) -> String {
         let _ = writeln!(
             text,
             "{apid:#05x}: the spacecraft restarted its packet counts after packet {last} of {kind}; losses there are unknown"
+        );
+    }
+    let waiting_h = waiting_h(gaps);
+    if waiting_h > 0.0 && !gaps.gaps.iter().any(|gap| gap.kind == PacketKind::Ephemeris) {
+        let _ = writeln!(
+            text,
+            "\n{waiting_h:.2} h of visibilities have no positions, and no packet of them is missing between those received: later ones are \
+             missing, or none has come."
         );
     }
     if gaps.gaps.is_empty() {

@@ -39,8 +39,9 @@ struct Inspection<'a> {
 
 pub(super) fn execute(args: &InspectArgs) -> CommandResult {
     let mut survey = GeometrySurvey::new(GeometryLimits::default());
-    let contents = Contents::read_with(&args.file, &mut |frame| survey.add(frame))?;
+    let mut contents = Contents::read_with(&args.file, &mut |frame| survey.add(frame))?;
     let geometry = survey.finish();
+    contents.without_positions = geometry.without_ephemeris;
     if args.json {
         print_json_line(&Inspection { contents: &contents, geometry: &geometry })?;
     } else {

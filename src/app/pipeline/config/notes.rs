@@ -162,23 +162,35 @@ impl Config {
         })
     }
 
-    /// A note if the node turns too little for C_l and errors of harmonic maps that are too large for their whole matrix, or joint.
+    /// A note if the node turns too little for C_l and errors of maps of pixels, and of harmonic maps that are too large for their whole
+    /// matrix, or joint.
     fn coverage_note(&self) -> Option<String> {
         let Self { array, map, spacecraft, joint, .. } = self;
-        let is_harmonic = map.method() == Method::Harmonic && map.regulariser() == RegulariserChoice::Data;
         let turn = spacecraft.duration_s / array.precession_period_s;
-        let unknowns = (map.degree() + 1).pow(2);
-        let may_mislead = is_harmonic && !map.refine.is_on() && (unknowns > WHOLE_UNKNOWNS_MAX || joint.on);
-        (may_mislead && array.is_circle() && turn < EVEN_SHARE).then(|| {
-            format!(
-                "in spacecraft.duration_s = {} the node turns by {:.1} of 360 deg: errors, mask and C_l of {} with R from the data may be far \
-                 from true (mean squares of (map - sky) / sigma 3 after 200 days, 5 after a month, 300 after a week); of single maps with map.l_max \
-                 up to 49 (nside 16) they hold",
-                spacecraft.duration_s,
-                360.0 * turn,
-                if joint.on { "joint maps" } else { "harmonic maps" },
-            )
-        })
+        if map.regulariser() != RegulariserChoice::Data || turn >= EVEN_SHARE {
+            return None;
+        }
+        let is_large = (map.degree() + 1).pow(2) > WHOLE_UNKNOWNS_MAX || joint.on;
+        let is_harmonic = match map.method() {
+            Method::Harmonic if !is_large || map.refine.is_on() || !array.is_circle() => return None,
+            method => method == Method::Harmonic,
+        };
+        let maps = match (is_harmonic, joint.on) {
+            (false, _) => "maps of pixels",
+            (true, false) => "harmonic maps",
+            (true, true) => "joint maps",
+        };
+        let figures = match is_harmonic {
+            false => "3 to 5 after a month at nside 8, means up to 5 sigma off",
+            true => {
+                "3 after 200 days, 5 after a month, 300 after a week; of single maps with map.l_max up to 49 (nside 16) they hold"
+            }
+        };
+        let (duration_s, turn_deg) = (spacecraft.duration_s, 360.0 * turn);
+        Some(format!(
+            "in spacecraft.duration_s = {duration_s} the node turns by {turn_deg:.1} of 360 deg: errors, mask and C_l of {maps} with R from the \
+             data may be far from true (mean squares of (map - sky) / sigma {figures})"
+        ))
     }
 
     /// A note if samples are coarsely quantised and the correlations are not corrected.

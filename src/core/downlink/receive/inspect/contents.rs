@@ -226,6 +226,9 @@ pub struct Contents {
     pub truncated_bytes: u64,
     /// Bytes of idle packets.
     pub idle_bytes: u64,
+    /// Good cross-correlations for whose times the file has no positions; 0 until the caller has counted them.
+    #[serde(skip)]
+    pub without_positions: u64,
     /// All counters of the reception.
     pub reception: ReceptionCounters,
 }
@@ -244,11 +247,16 @@ impl Contents {
         )
     }
 
-    /// Whether the file is undamaged and complete: all visibilities that the spacecraft has sampled are in the file or were
-    /// dropped on board.
+    /// Whether the file is undamaged and complete: all visibilities that the spacecraft has sampled are in the file, with positions and finite
+    /// values, or were dropped on board.
     #[must_use]
     pub fn is_sound(&self) -> bool {
-        self.is_undamaged() && self.found_minus_reported() == Some(0)
+        self.is_undamaged() && self.is_usable() && self.found_minus_reported() == Some(0)
+    }
+
+    /// Whether all its visibilities have positions, and values and weights that can be used.
+    pub(super) fn is_usable(&self) -> bool {
+        self.without_positions + self.reception.visibilities_bad_value == 0
     }
 
     /// Whether the file has no gaps and no damage, and every payload was decoded.

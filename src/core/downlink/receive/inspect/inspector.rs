@@ -292,6 +292,7 @@ impl Inspector {
             truncated_bytes: reception.bytes_truncated,
             idle_bytes: self.idle_bytes
                 + reception.frames.as_ref().map_or(0, |frames| frames.bytes_idle_packets),
+            without_positions: 0,
             reception: reception.clone(),
         }
     }

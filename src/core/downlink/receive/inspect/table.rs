@@ -186,7 +186,15 @@ impl Contents {
 
     /// The verdict on a file that is not known to be sound.
     fn show_verdict(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.is_usable() {
+            let (without, bad) = (self.without_positions, self.reception.visibilities_bad_value);
+            writeln!(
+                f,
+                "\nnot sound: {without} good visibilities have no positions in this file, and {bad} no finite value and positive weight"
+            )?;
+        }
         let verdict = match self.is_undamaged() {
+            true if !self.is_usable() => "otherwise",
             true => "not known to be sound: no gaps, no bad checksums, no garbage, not truncated, but",
             false => "not sound: packets are missing, damaged or not readable, as listed below;",
         };
