@@ -152,6 +152,7 @@ impl Plan {
                 visibilities: expected.mapped,
                 windows,
                 node_turns: self.node_turns(),
+                duration_s: self.config.spacecraft.duration_s,
                 every_nth: self.schedules[channel].every_nth as f64,
                 solutions,
                 limb_range_rad,
