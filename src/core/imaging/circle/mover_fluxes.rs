@@ -12,7 +12,7 @@ use std::fmt;
 use bincode::{Decode, Encode};
 use serde::Serialize;
 
-use super::movers::{MONTH_S, MoverColumns};
+use super::mover_columns::{Column, MONTH_S, MoverColumns};
 use super::posterior::NOISES_TOGETHER;
 use super::solve::{HarmonicRequest, largest_of_circle, predicted_power, prior_unknowns};
 use super::whole::PowerEquations;
@@ -208,7 +208,7 @@ impl MoverColumns {
 
     fn fluxes(&self, powers: Option<&Powers>, noise_factor: f64) -> MoverFluxes {
         let k_sr = k_sr_per_jy(self.frequency_hz);
-        let flux = |(k, column): (usize, &super::movers::Column)| {
+        let flux = |(k, column): (usize, &Column)| {
             let variance = powers.and_then(|powers| powers.variance[k]);
             MoverFlux {
                 mover: column.body,

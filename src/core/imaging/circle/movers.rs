@@ -12,6 +12,7 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::grid::{Grids, NODES};
+use super::mover_columns::{Column, MONTH_S, MoverColumns};
 use super::quanta::{Quanta, right_values};
 use super::spread::{GriddedTerms, TorusPoint, add_pair};
 use super::sums::HarmonicSums;
@@ -26,11 +27,7 @@ use crate::response::beacon::plane_wave;
 use crate::response::pixel::PairGeometry;
 use crate::response::pixel::exact::envelope;
 use crate::sky::Body;
-use crate::units::constants::DAY_S;
 use crate::units::vector::{Vec3, sub};
-
-/// Length of a month, s.
-pub const MONTH_S: f64 = 30.0 * DAY_S;
 
 /// Maximum number of bodies: their right-hand sides are gridded in pairs.
 pub const BODIES_MAX: usize = 2;
@@ -102,30 +99,6 @@ pub struct MoverSums {
     /// Visibilities beyond the last month that has a column.
     beyond: i64,
     pending: Vec<Waiting>,
-}
-
-/// The column of a body in a month.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Column {
-    pub(super) body: Body,
-    pub(super) month: i64,
-}
-
-/// All columns of the bodies at a power of 1 K sr, with their products; see [`MoverSums`].
-#[derive(Clone, Debug)]
-pub struct MoverColumns {
-    pub(super) columns: Vec<Column>,
-    /// `BtN^-1P`, by column.
-    pub(super) right: Vec<Vec<f64>>,
-    /// `P'N^-1P`, row by row, (K sr)^-2.
-    pub(super) products: Vec<f64>,
-    /// `P'N^-1V`, (K sr)^-1.
-    pub(super) data: Vec<f64>,
-    /// The same of the noise of the noise-only map.
-    pub(super) noise: Vec<f64>,
-    pub(super) frequency_hz: f64,
-    /// Visibilities of months without a column.
-    pub(super) beyond: u64,
 }
 
 impl MoverSums {

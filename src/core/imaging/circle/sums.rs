@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
 use super::grid::Grids;
-use super::movers::MoverColumns;
+use super::mover_columns::MoverColumns;
 use super::operator::{Operator, RightHandSide, SharedTori};
 use super::stored::TorusPart;
 use super::tori::Tori;
