@@ -20,6 +20,7 @@ mod harmonic;
 mod instrument;
 mod joint;
 mod live_gains;
+mod movers;
 mod navigation;
 mod orbit_files;
 mod orbits;

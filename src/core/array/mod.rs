@@ -1,6 +1,6 @@
 //! Orbit and formation of the daughters, stations on the Moon, occultation by the Moon, observing windows, and the ephemeris.
 //!
-//! Pure functions of time and position; uses [`crate::units`] and [`crate::frames`].
+//! Pure functions of time and position; uses [`crate::units`], [`crate::frames`], and the names of bodies of [`crate::sky`].
 //!
 //! Coordinates are centred on the Moon, on ecliptic axes: x towards ecliptic longitude 0, z towards the north ecliptic
 //! pole.
@@ -31,7 +31,9 @@ pub use attitudes::Attitudes;
 #[doc(hidden)]
 pub use baseline::scaled_baseline;
 #[doc(hidden)]
-pub use bodies::{EarthModel, earth_is_hidden_by_date, jupiter_hat_by_date, sun_hat_by_date};
+pub use bodies::{
+    EarthModel, body_hat_by_date, earth_is_hidden_by_date, jupiter_hat_by_date, sun_hat_by_date,
+};
 pub use config::{ArrayConfig, ArrayError};
 #[doc(hidden)]
 pub use config::{BreathingConfig, NodeMotion, Spacing};

@@ -13,9 +13,10 @@ const COVERAGE_EXPONENT: f64 = 1.4;
 /// Maximum number of iterations of a solution from few windows, which determine few harmonics.
 const ITERATIONS_FEW: f64 = 180.0;
 
-/// Columns that are solved together: a map and its noise map, or, with R from the data, the errors of mean and dipole.
+/// Columns that are solved together: a map and its noise map, or, with R from the data, the errors of mean and dipole; or those of bodies that
+/// move.
 pub(in crate::imaging) fn solved_together(map: &MapConfig) -> usize {
-    if map.regulariser() == RegulariserChoice::Data { 4 } else { 2 }
+    if map.regulariser() == RegulariserChoice::Data || !map.movers.is_empty() { 4 } else { 2 }
 }
 
 /// Maximum number of intermediate maps whose products are counted one by one.
@@ -54,6 +55,8 @@ pub struct ChannelData {
     pub windows: f64,
     /// Turns of the orbit's node.
     pub node_turns: f64,
+    /// Length of the mission, s.
+    pub duration_s: f64,
     /// Every so many integrations are sent.
     pub every_nth: f64,
     /// Number of maps: intermediate ones and the final one.
@@ -98,6 +101,7 @@ mod tests {
         visibilities: 25_000.0,
         windows: 200.0,
         node_turns: 1.0,
+        duration_s: 4.1e7,
         every_nth: 1.0,
         solutions: 1,
         limb_range_rad: 0.05,

@@ -115,6 +115,12 @@ pub enum AccumulationError {
         "map.refine with a saved state of several ranks; expected one process, or map.refine.passes_max = 0"
     )]
     HeldByRank,
+    /// Bodies that move are to be solved for where that is not possible.
+    #[error("map.movers with {what}; expected none, or one process without a saved state")]
+    Movers {
+        /// What they are not solved with.
+        what: &'static str,
+    },
     /// A segment of visibilities is missing or damaged.
     #[error("{}: found {found}; expected the visibilities that the checkpoint names", path.display())]
     Segment {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::anywhere::{AssumedInstrument, RefineRule, Refinement};
-use super::circle::HarmonicSums;
+use super::circle::{HarmonicSums, MoverFluxes};
 use super::solver::{Diagnostics, NamedWatch, PointBeam, SolveWatch, StoppingRule};
 use super::{Regulariser, Samples, Uncertainty};
 use crate::frames::Instrument;
@@ -138,4 +138,6 @@ pub struct SolvedMap {
     pub refinement: Option<Refinement>,
     /// Errors, with R from the data.
     pub uncertainty: Option<Uncertainty>,
+    /// Fluxes of the bodies that were solved for beside it.
+    pub movers: Option<MoverFluxes>,
 }

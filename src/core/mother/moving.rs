@@ -6,12 +6,12 @@ use std::sync::Arc;
 
 use num_complex::Complex64;
 
-use crate::array::{Array, hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
+use crate::array::{Array, body_hat_by_date, hidden_by_moon};
 use crate::frames::{AntennaResponse, Channel, ObservingWindow};
 use crate::response::beacon::plane_wave;
 use crate::response::pixel::exact::envelope;
 use crate::response::pixel::{PairGeometry, SingleGeometry};
-use crate::sky::{Body, MovingDirection, MovingSource, ecliptic_deg, k_sr_per_jy};
+use crate::sky::{MovingDirection, MovingSource, ecliptic_deg, k_sr_per_jy};
 use crate::units::Pair;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, direction, dot, sub};
@@ -58,8 +58,7 @@ impl MovingSky {
     /// Direction of a source at a time.
     fn source_hat(&self, source: &MovingSource, t_s: f64) -> Vec3 {
         match source.direction {
-            MovingDirection::Body(Body::Sun) => sun_hat_by_date(self.epoch_tai_s, t_s),
-            MovingDirection::Body(Body::Jupiter) => jupiter_hat_by_date(self.epoch_tai_s, t_s),
+            MovingDirection::Body(body) => body_hat_by_date(body, self.epoch_tai_s, t_s),
             MovingDirection::Fixed([longitude_deg, latitude_deg]) => direction(longitude_deg, latitude_deg),
         }
     }

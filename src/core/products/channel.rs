@@ -272,6 +272,7 @@ impl ChannelFolder {
             },
             diagnostics: solution.diagnostics,
             refinement: solution.refinement.clone(),
+            movers: solution.movers.clone(),
             snapshots: self.snapshots.clone(),
             thermal_noise: !solution.instrument.noiseless,
             post_processing: self.config.processing(),
@@ -333,7 +334,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Writes what belongs to the solution, not to its post-processing: errors by pixel, the sky's power, residuals.
+    /// Writes what belongs to the solution, not to its post-processing: errors by pixel, the sky's power, residuals, bodies that move.
     fn write_errors(&mut self, origin: Origin<'_>) -> Result<(), ProductsError> {
         if let Some(errors) = &origin.solution.uncertainty {
             for map in ErrorMap::all(errors) {
@@ -350,6 +351,10 @@ impl ChannelFolder {
         }
         if let Some(refinement) = &origin.solution.refinement {
             write_product(&self.register_file("residuals.csv"), refinement.chi_square.csv().as_bytes())?;
+        }
+        if let Some(movers) = &origin.solution.movers {
+            let table = movers.csv(self.frequency_hz);
+            write_product(&self.register_file("movers.csv"), table.as_bytes())?;
         }
         Ok(())
     }

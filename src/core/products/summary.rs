@@ -10,6 +10,7 @@ use super::error_maps::{limits, told_vector};
 use super::latitudes::LatitudeError;
 use super::point_beams::{BeamWidths, PointBeamSummary};
 use crate::imaging::anywhere::Refinement;
+use crate::imaging::circle::MoverFluxes;
 use crate::imaging::{Convergence, Diagnostics, GainUncertainty, SkyPower};
 
 /// Summary of one snapshot.
@@ -85,6 +86,9 @@ pub struct ChannelSummary {
     /// Report on the iterative refinement with exact positions; absent without `map.refine`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refinement: Option<Refinement>,
+    /// Fluxes of bodies that move, which the map is without; absent without `map.movers`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub movers: Option<MoverFluxes>,
     /// The snapshots, including the final map.
     pub snapshots: Vec<SnapshotSummary>,
     /// Whether the visibilities, and so the map, contain thermal noise; always true for real data.
@@ -194,6 +198,9 @@ impl fmt::Display for ChannelSummary {
             let Convergence { iterations, residual, converged } = convergence;
             let warning = if converged { "" } else { ": not converged, increase map.iterations_max" };
             write!(f, "\n             {iterations} iterations, residual {residual:.1e}{warning}")?;
+        }
+        if let Some(movers) = &self.movers {
+            write!(f, "\n             {movers}")?;
         }
         if let Some((fwhm_deg, noise_jy)) =
             self.beam.as_ref().and_then(|beam| Some((beam.fwhm_deg?, beam.noise_rms_jy?)))

@@ -31,13 +31,24 @@ pub enum MovingDirection {
 }
 
 /// Bodies with a known direction by date.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, bincode::Encode, bincode::Decode)]
 #[serde(rename_all = "kebab-case")]
 pub enum Body {
     /// The Sun.
     Sun,
     /// Jupiter.
     Jupiter,
+}
+
+impl Body {
+    /// Its name in files.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Sun => "sun",
+            Self::Jupiter => "jupiter",
+        }
+    }
 }
 
 /// A point source with steady flux, bursts or both (`[[sky.moving]]`); all bursts have the same light curve: a linear rise, then an exponential decay.

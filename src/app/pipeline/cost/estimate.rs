@@ -144,7 +144,6 @@ impl Plan {
         let sent: f64 = expected.iter().map(|e| e.sent).sum();
         let solutions = self.solutions(sent);
         let (windows, limb_range_rad) = (self.windows.len() as f64, self.limb_range_rad());
-        let error_draws = self.config.calibration.known_error_draws();
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
             let is_mapped = map.is_mapped(ChannelId(channel as u16));
             let data = ChannelData {
@@ -152,10 +151,11 @@ impl Plan {
                 visibilities: expected.mapped,
                 windows,
                 node_turns: self.node_turns(),
+                duration_s: self.config.spacecraft.duration_s,
                 every_nth: self.schedules[channel].every_nth as f64,
                 solutions,
                 limb_range_rad,
-                error_draws,
+                error_draws: self.config.calibration.known_error_draws(),
             };
             if is_mapped { map.cost(data).with_ranks(ranks, map) } else { EngineCost::default() }
         };

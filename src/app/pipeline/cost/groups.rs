@@ -157,6 +157,7 @@ pub(in crate::pipeline) fn complete_costs(
             windows: unlimited,
             // The whole matrix of a short mission counts.
             node_turns: 0.0,
+            duration_s: unlimited,
             every_nth: 1.0,
             solutions,
             limb_range_rad: unlimited,

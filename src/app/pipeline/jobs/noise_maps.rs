@@ -36,10 +36,10 @@ pub(in crate::pipeline) struct NoiseMaps<'a> {
 }
 
 impl Config {
-    /// Whether noise realisations can share the weights and the matrix: with the harmonic engine, without iterative refinement and
-    /// without random errors of the instrument.
+    /// Whether noise realisations can share the weights and the matrix: with the harmonic engine, without iterative refinement, random errors
+    /// of the instrument, and bodies that are solved for beside the map.
     pub(in crate::pipeline) fn shares_realisations(&self) -> bool {
-        self.map.method() == Method::Harmonic && !self.has_errors()
+        self.map.method() == Method::Harmonic && !self.has_errors() && self.map.movers.is_empty()
     }
 }
 

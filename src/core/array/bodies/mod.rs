@@ -16,6 +16,7 @@ pub(super) use orientation::{MoonAxes, Orientation};
 
 use super::config::ArrayConfig;
 use crate::frames::EphemerisSegment;
+use crate::sky::Body;
 use crate::units::constants::SIDEREAL_MONTH_S;
 use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, dot, norm, sub, unit};
@@ -176,6 +177,16 @@ pub fn jupiter_hat_by_date(epoch_tai_s: f64, t_s: f64) -> Vec3 {
         std::array::from_fn(|k| sun[k] + jupiter[k])
     };
     unit(sub(from_earth_m, moon::position_m(centuries)))
+}
+
+/// Direction of a body from the Moon's centre some seconds after a mission's epoch (TAI since 1958-01-01, s).
+#[must_use]
+#[doc(hidden)]
+pub fn body_hat_by_date(body: Body, epoch_tai_s: f64, t_s: f64) -> Vec3 {
+    match body {
+        Body::Sun => sun_hat_by_date(epoch_tai_s, t_s),
+        Body::Jupiter => jupiter_hat_by_date(epoch_tai_s, t_s),
+    }
 }
 
 /// Direction of the Sun from the Moon, on ecliptic axes of J2000; geometric, to 0.002 degrees from 2020 to 2040.

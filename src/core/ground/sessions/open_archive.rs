@@ -136,6 +136,9 @@ impl OpenArchive {
         if config.map.holds_visibilities() && ranks.is_distributed() {
             return Err(AccumulationError::HeldByRank.into());
         }
+        if !config.map.movers.is_empty() {
+            return Err(AccumulationError::Movers { what: "a saved state" }.into());
+        }
         let mut folder = match renames_damaged || ranks.is_distributed() {
             true => StateFolder::open_with_ranks(folder, ranks)?,
             false => StateFolder::open_to_read(folder)?,

@@ -3,7 +3,7 @@
 use super::grid::ERROR_PAIR_MULTIPLY_ADDS;
 use super::setup::error_pair_share;
 use super::whole::{EVEN_SHARE, WHOLE_UNKNOWNS_MAX};
-use super::{SPREAD_MULTIPLY_ADDS, application_size, memory, shared_size};
+use super::{MONTH_S, MONTHS_MAX, SPREAD_MULTIPLY_ADDS, application_size, memory, shared_size};
 use crate::imaging::cost::{
     BASIS_VECTORS, ChannelData, EngineCost, ITERATIONS, iterations, over_maps, solved_together,
 };
@@ -88,9 +88,25 @@ const COLUMN_SHARE: f64 = 0.1;
 /// Matrices of this size in memory at once: the matrix, its eigenvectors, what is made of both, a factor and its inverse.
 const MATRICES: f64 = 6.0;
 
+/// Months of a mission in which bodies that move have columns.
+fn mover_months(duration_s: f64) -> f64 {
+    (duration_s / MONTH_S).ceil().clamp(1.0, MONTHS_MAX as f64)
+}
+
+/// Products for bodies that move, if the map and its noise map take `last`, and the whole matrix `whole`: columns, data and noise are solved for,
+/// and each column is projected; the largest eigenvalue, or the sky's power and the matrix, are found once more.
+fn mover_products(map: &MapConfig, (duration_s, last): (f64, f64), whole: f64) -> f64 {
+    if map.movers.is_empty() {
+        return 0.0;
+    }
+    let columns = map.movers.len() as f64 * mover_months(duration_s);
+    let rounds = if map.regulariser() == RegulariserChoice::Data { 2.0 } else { 1.0 };
+    columns + rounds * (last + (columns + SOLVED) / SOLVED * last) + whole
+}
+
 /// The cost of sums on one circular orbit.
 pub(in crate::imaging) fn harmonic_cost(map: &MapConfig, data: ChannelData) -> EngineCost {
-    let ChannelData { frequency_hz, windows, node_turns, error_draws, .. } = data;
+    let ChannelData { frequency_hz, windows, node_turns, error_draws, duration_s, .. } = data;
     let l_max = map.degree();
     let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
     let memory = memory(l_max, u_max, rayon::current_num_threads(), solved_together(map));
@@ -119,19 +135,26 @@ pub(in crate::imaging) fn harmonic_cost(map: &MapConfig, data: ChannelData) -> E
         // A beam takes half as many as the map and its noise map.
         + 0.5 * last * map.beams_deg.len() as f64
         // A draw takes as many as the map.
-        + draws / SOLVED * last;
+        + draws / SOLVED * last
+        + mover_products(map, (duration_s, last), columns);
     let pairs = 0.5 * error_draws as f64;
-    let sums_bytes = memory.sums as f64 * reached * (1.0 + pairs * error_pair_share(l_max, u_max));
-    let visibility_multiply_adds = SPREAD_MULTIPLY_ADDS + pairs * ERROR_PAIR_MULTIPLY_ADDS;
+    let of_movers = if map.movers.is_empty() { 0.0 } else { 1.0 };
+    // Of the alphas that two months reach both have a row.
+    let month_rows = reached + mover_months(duration_s) * WINDOW_ALPHAS / points;
+    let of_pairs = error_pair_share(l_max, u_max) * (pairs * reached + of_movers * month_rows);
+    let sums_bytes = memory.sums as f64 * (reached + of_pairs);
+    let visibility_multiply_adds = SPREAD_MULTIPLY_ADDS + (pairs + of_movers) * ERROR_PAIR_MULTIPLY_ADDS;
     let vector_bytes = 8.0 * unknowns;
     let matrix_bytes = if is_whole { MATRICES * vector_bytes * unknowns } else { 0.0 };
+    // Right-hand sides and solutions.
+    let column_vectors = 2.0 * (map.movers.len() as f64 * mover_months(duration_s) + SOLVED);
     let vectors = BASIS_VECTORS[usize::from(map.trace_probes > 0)];
     EngineCost {
         sums_bytes,
         // The final map is solved in the memory of the sums, whose integers are freed node by node.
         copy_bytes: sums_bytes,
         other_bytes: (memory.tables + memory.workspace) as f64
-            + (vectors + draws) * vector_bytes
+            + (vectors + draws + of_movers * column_vectors) * vector_bytes
             + matrix_bytes,
         visibility_s: visibility_multiply_adds
             / SPREAD_MULTIPLY_ADDS
@@ -160,6 +183,7 @@ mod tests {
                     visibilities: 29_000.0,
                     windows,
                     node_turns,
+                    duration_s: days * 86_400.0,
                     every_nth: 1.0,
                     solutions: 1,
                     limb_range_rad: 0.0,

@@ -29,6 +29,9 @@ mod exact;
 mod gain_errors;
 mod grid;
 mod lines;
+mod mover_columns;
+mod mover_fluxes;
+mod movers;
 mod noise_maps;
 mod noises;
 mod operator;
@@ -57,6 +60,9 @@ pub use blocks::{OrderBlocks, OrderFactors};
 pub(super) use cost::harmonic_cost;
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
+pub use mover_columns::{MONTH_S, MoverColumns};
+pub use mover_fluxes::{MoverFlux, MoverFluxes};
+pub use movers::{BODIES_MAX, MONTHS_MAX, MoverSums};
 pub use noise_maps::solve_noises;
 pub use noises::NoiseSums;
 pub use parts::SumPart;
@@ -164,6 +170,7 @@ impl HarmonicBasis {
             right: OnceLock::new(),
             noise: OnceLock::new(),
             noise_realisations: Vec::new(),
+            movers: None,
             gain_error_tori,
             gain_errors: OnceLock::new(),
             gain_error_power: 0.0,

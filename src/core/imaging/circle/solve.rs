@@ -121,7 +121,7 @@ pub fn solve_regularised(
 }
 
 /// The part of `V'N^-1V` that a prior p explains, `p.(2 b - A p)`, with `right` = b - A p.
-fn predicted_power(sums: &HarmonicSums, prior: &[f64], right: &[f64]) -> f64 {
+pub(super) fn predicted_power(sums: &HarmonicSums, prior: &[f64], right: &[f64]) -> f64 {
     dot(prior, sums.right_hand_side()) + dot(prior, right)
 }
 

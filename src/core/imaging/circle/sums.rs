@@ -6,6 +6,7 @@ use std::sync::{Arc, OnceLock};
 use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
 use super::grid::Grids;
+use super::mover_columns::MoverColumns;
 use super::operator::{Operator, RightHandSide, SharedTori};
 use super::stored::TorusPart;
 use super::tori::Tori;
@@ -41,6 +42,8 @@ pub struct HarmonicSums {
     pub(super) noise: OnceLock<Vec<f64>>,
     /// Right-hand sides of additional noise realisations.
     pub(super) noise_realisations: Vec<Vec<f64>>,
+    /// Columns of bodies that move; `None` if none are solved for.
+    pub(super) movers: Option<MoverColumns>,
     /// The share of pairs of right-hand sides of draws of the errors by gains.
     pub(super) gain_error_tori: Vec<Tori>,
     pub(super) gain_errors: OnceLock<Vec<Vec<f64>>>,

@@ -61,6 +61,10 @@ impl MapConfig {
         for (key, value) in self.limits.values() {
             checks.number(key, value, value >= 0.0, "not negative");
         }
+        for (index, body) in self.movers.iter().enumerate() {
+            let is_new = !self.movers[..index].contains(body);
+            checks.require(format!("movers[{index}]"), format!("{body:?}"), is_new, "every body once");
+        }
         self.check_refinement(&mut checks);
         self.check_regularisation(&mut checks);
         let weight = self.weight_max;

@@ -14,9 +14,9 @@ use crate::imaging::assumed_instrument::AssumedInstrument;
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::response::{MeasuredAntennas, MeasuredAntennasError};
-use crate::sky::Frame;
 use crate::sky::fits::{ReadOptions, check_frequency};
 use crate::sky::healpix::pixel_area_sr;
+use crate::sky::{Body, Frame};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, PerChannel, keys};
 
@@ -130,6 +130,11 @@ keys! {
         /// as it ends.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         expert beyond_files: Vec<PathBuf> = Vec::new();
+        /// Bodies that move, "sun" and "jupiter", whose flux in each month of 30 days is solved for beside a final map, which is then
+        /// without them. Not with a saved state or several ranks.
+        #[only_with("map.engine = \"harmonic\" and no map.refine.passes_max")]
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        expert movers: Vec<Body> = Vec::new();
         /// Ecliptic longitudes and latitudes of points whose effective beam is computed, such as `[[0.0, 90.0]]`.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         everyday beams_deg: Vec<[f64; 2]> = Vec::new();
@@ -310,6 +315,7 @@ impl MapConfig {
             epsilon: _,
             regulariser: _,
             beyond_files: _, // By their contents.
+            movers: _,       // No state has them.
             beams_deg: _,
             prior_k: _,
             prior_files: _,

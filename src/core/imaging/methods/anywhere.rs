@@ -173,7 +173,7 @@ impl MapEquations for VisibilityArchive {
         }
         let HarmonicSolution { map_k, noise_k, diagnostics, uncertainty, .. } = solved;
         let (beams, refinement) = (Vec::new(), Some(found));
-        Ok(Some(SolvedMap { map_k, noise_k, diagnostics, beams, refinement, uncertainty }))
+        Ok(Some(SolvedMap { map_k, noise_k, diagnostics, beams, refinement, uncertainty, movers: None }))
     }
 
     fn into_harmonic(self: Box<Self>) -> Result<Box<HarmonicSums>, &'static str> {

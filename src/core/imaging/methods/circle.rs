@@ -6,8 +6,8 @@ use std::path::Path;
 use crate::frames::{PlacedVisibilities, VisibilityReason};
 use crate::imaging::anywhere::SegmentFolder;
 use crate::imaging::circle::{
-    HarmonicEngine, HarmonicRequest, HarmonicSetup, HarmonicSolution, HarmonicSums, NoiseSums, SumPart,
-    beams_with_power, harmonic_beams, harmonic_cost, nominal_orbit, solve_regularised,
+    HarmonicEngine, HarmonicRequest, HarmonicSetup, HarmonicSolution, HarmonicSums, MoverSums, NoiseSums,
+    SumPart, beams_with_power, harmonic_beams, harmonic_cost, nominal_orbit, solve_regularised,
 };
 use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::method::{MapEquations, MapMethod, MapSums, NewChannel, NewOrRefused, same_method};
@@ -43,9 +43,16 @@ impl MapMethod for CircleMaps {
             weight_max,
         })?
         .with_ranks(&share.part.as_ref().map_or_else(|| share.ranks.clone(), SumPart::ranks));
+        if !config.movers.is_empty() && (share.part.is_some() || share.ranks.is_distributed()) {
+            return Err(AccumulationError::Movers {
+                what: "parts of the sums (several ranks, or memory for all of them)",
+            });
+        }
+        let movers = (!config.movers.is_empty())
+            .then(|| MoverSums::new(&engine, &config.movers, instrument.epoch_tai_s));
         let seeds = &share.realisation_seeds;
         let realisations = (!seeds.is_empty()).then(|| NoiseSums::new(&engine, seeds));
-        Ok(Ok(Box::new(CircleSums { engine, realisations, part: share.part.clone() })))
+        Ok(Ok(Box::new(CircleSums { engine, realisations, movers, part: share.part.clone() })))
     }
 
     fn load(
@@ -56,7 +63,7 @@ impl MapMethod for CircleMaps {
         (part, ranks): (RankShare, &Ranks),
     ) -> Result<Box<dyn MapSums>, AccumulationError> {
         let engine = HarmonicEngine::restore_part(from, part, ranks)?;
-        Ok(Box::new(CircleSums { engine, realisations: None, part: None }))
+        Ok(Box::new(CircleSums { engine, realisations: None, movers: None, part: None }))
     }
 
     fn cost(&self, map: &MapConfig, data: ChannelData) -> EngineCost {
@@ -64,10 +71,11 @@ impl MapMethod for CircleMaps {
     }
 }
 
-/// The sums of a channel, with those of additional noise realisations.
+/// The sums of a channel, with those of additional noise realisations and of bodies that move.
 struct CircleSums {
     engine: HarmonicEngine,
     realisations: Option<NoiseSums>,
+    movers: Option<MoverSums>,
     /// The part of the sums that this reading of the data makes.
     part: Option<SumPart>,
 }
@@ -78,12 +86,18 @@ impl MapSums for CircleSums {
         if let Some(realisations) = &mut self.realisations {
             realisations.add(&self.engine, placed);
         }
+        if let Some(movers) = &mut self.movers {
+            movers.add(&self.engine, placed);
+        }
         Ok(added)
     }
 
     fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
         if let Some(realisations) = &mut self.realisations {
             realisations.remove(&self.engine, placed);
+        }
+        if let Some(movers) = &mut self.movers {
+            movers.remove(&self.engine, placed);
         }
         self.engine.remove(placed)
     }
@@ -114,6 +128,10 @@ impl MapSums for CircleSums {
             (None, Some(noises)) => Some(self.engine.into_sums().with_noise_realisations(noises)),
             (None, None) => Some(self.engine.into_sums()),
         };
+        let sums = match self.movers {
+            Some(movers) => sums.map(|sums| sums.with_movers(movers)),
+            None => sums,
+        };
         Ok(sums.map(|sums| Box::new(sums) as Box<dyn MapEquations>))
     }
 }
@@ -123,9 +141,10 @@ impl MapEquations for HarmonicSums {
         NormalSums::counts(self)
     }
 
-    fn solve(self: Box<Self>, request: MapRequest<'_>) -> Result<Option<SolvedMap>, SolveError> {
+    fn solve(mut self: Box<Self>, request: MapRequest<'_>) -> Result<Option<SolvedMap>, SolveError> {
         let settings = HarmonicRequest::of(&request);
         let (regulariser, prior, watch) = (&request.regulariser, request.prior.as_deref(), request.watch);
+        let movers = self.take_movers(settings, regulariser, prior, watch)?;
         let start = request.last.take();
         let solved = solve_regularised(&self, settings, regulariser, prior, start.as_ref(), watch);
         if let Some(reason) = self.failure() {
@@ -159,7 +178,7 @@ impl MapEquations for HarmonicSums {
             (Some(kept), true) => kept.keep(request.channel, request.nside, *self),
             (None, true) => {}
         }
-        Ok(Some(SolvedMap { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty }))
+        Ok(Some(SolvedMap { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty, movers }))
     }
 
     fn into_harmonic(self: Box<Self>) -> Result<Box<HarmonicSums>, &'static str> {

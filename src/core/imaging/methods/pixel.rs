@@ -142,7 +142,7 @@ impl MatrixFreeVisibilities {
 impl PixelSolution {
     fn into_map(self, uncertainty: Option<Uncertainty>) -> SolvedMap {
         let Self { map_k, noise_k, diagnostics, beams } = self;
-        SolvedMap { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty }
+        SolvedMap { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty, movers: None }
     }
 }
 

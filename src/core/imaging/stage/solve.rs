@@ -7,6 +7,7 @@ use super::snapshot::Snapshot;
 use crate::frames::Instrument;
 use crate::imaging::SolveError;
 use crate::imaging::anywhere::Refinement;
+use crate::imaging::circle::MoverFluxes;
 use crate::imaging::request::{LastSolution, MapRequest, SolvedMap, SolverSetup};
 use crate::imaging::solver::{Diagnostics, PointBeam};
 use crate::imaging::{SumCounts, Uncertainty};
@@ -44,6 +45,8 @@ pub struct Solution {
     pub refinement: Option<Refinement>,
     /// Errors of the map, and the sky's power that determines R; only with R from the data.
     pub uncertainty: Option<Uncertainty>,
+    /// Fluxes of the bodies that move, which the map is without; only of a final map with `map.movers`.
+    pub movers: Option<MoverFluxes>,
 }
 
 impl Solution {
@@ -152,7 +155,8 @@ impl Stage for Solver {
         if is_interrupted && !is_final {
             return Ok(());
         }
-        let SolvedMap { map_k, noise_k, diagnostics, mut beams, refinement, mut uncertainty } = solved;
+        let SolvedMap { map_k, noise_k, diagnostics, mut beams, refinement, mut uncertainty, movers } =
+            solved;
         if is_interrupted {
             // They are of equations that were not solved.
             beams.clear();
@@ -176,6 +180,9 @@ impl Stage for Solver {
             diagnostics,
             refinement,
             uncertainty: uncertainty.map(|errors| errors.divided_by(1.0 + self.setup.moon_reflection)),
+            movers: movers
+                .filter(|_| !is_interrupted)
+                .map(|fluxes| fluxes.divided_by(1.0 + self.setup.moon_reflection)),
         });
         Ok(())
     }

@@ -13,8 +13,8 @@ use crate::units::{StreamKind, random_stream};
 
 const SATELLITES: usize = 8;
 /// Baselines up to 1.1 wavelengths, which see up to l = 7.
-const LOW_HZ: f64 = 0.25e6;
-const DEGREE: usize = 8;
+pub(super) const LOW_HZ: f64 = 0.25e6;
+pub(super) const DEGREE: usize = 8;
 const PASSES: usize = 30;
 const TIMES: usize = 14;
 const NSIDE: usize = 8;
@@ -23,7 +23,7 @@ const NOISE_K_SR: f64 = 3e3;
 /// Standard deviations of ln amplitude and phase, rad. The second order is below a tenth of the first.
 const SIGMA: [f64; 2] = [0.04, 0.07];
 
-fn low_setup() -> HarmonicSetup {
+pub(super) fn low_setup() -> HarmonicSetup {
     HarmonicSetup { l_max: DEGREE, frequency_hz: LOW_HZ, baseline_m_max: 1_300.0, weight_max: 1.0, ..setup() }
 }
 
@@ -32,7 +32,7 @@ fn start_s(pass: usize) -> f64 {
 }
 
 /// Positions of all pairs with short baselines in all passes; no data yet.
-fn geometry() -> Vec<PlacedVisibilities> {
+pub(super) fn geometry() -> Vec<PlacedVisibilities> {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let mut blocks = Vec::new();
     for pass in 0..PASSES {
@@ -59,7 +59,7 @@ fn geometry() -> Vec<PlacedVisibilities> {
 }
 
 /// Visibilities of a sky by the forward model, which has rows of its own.
-fn observed(unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
+pub(super) fn observed(unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
     let setup = low_setup();
     let wavelength_m = setup.wavelength_m();
     let geometry = PatternGeometry {
@@ -82,13 +82,13 @@ fn observed(unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
     values
 }
 
-fn normals(seed: u64, which: u64, count: usize) -> Vec<f64> {
+pub(super) fn normals(seed: u64, which: u64, count: usize) -> Vec<f64> {
     let mut stream = random_stream(seed, StreamKind::Instrument, [which, 43]);
     (0..count).map(|_| StandardNormal.sample(&mut stream)).collect()
 }
 
 /// A sky of 3e5 K with structure that falls with the degree.
-fn sky(seed: u64) -> Vec<f64> {
+pub(super) fn sky(seed: u64) -> Vec<f64> {
     let mut sky = normals(seed, 0, (DEGREE + 1).pow(2));
     sky.iter_mut().zip(degrees(DEGREE)).for_each(|(x, l)| *x *= 1e5 * ((l + 1) as f64).powf(-1.3));
     sky[0] = 1e6;

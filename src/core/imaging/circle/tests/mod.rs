@@ -1,5 +1,6 @@
 mod coverage;
 mod gain_errors;
+mod movers;
 mod resolution;
 mod shared;
 mod whole;
