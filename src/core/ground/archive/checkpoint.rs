@@ -393,6 +393,7 @@ mod tests {
             ("autos", length(bincode::encode_to_vec(head.autos, config))),
             ("accumulator", length(bincode::encode_to_vec(&head.accumulator, config))),
             ("journal", length(bincode::encode_to_vec(head.journal, config))),
+            ("calibration", length(bincode::encode_to_vec(&head.calibration, config))),
             ("engines", 7),
             ("checksum", 8),
         ];
