@@ -15,7 +15,7 @@ use crate::pipeline::{BurstsReport, bursts_of_downlink, use_threads};
 /// that overlap in time in any channels are one event. In all channels the flux density from its direction is fitted by time, each value with its
 /// standard error.
 ///
-/// Leaves event-N.csv (light curves of all channels), event-N.png (dynamic spectrum; grey where no value is above its error) and summary.json
+/// Leaves event-0001.csv and so on (light curves of all channels), event-0001.png (dynamic spectrum; grey where no value is above its error) and summary.json
 /// in the output folder.
 ///
 /// Example: lunarray bursts pass-*.ccsds --out bursts/
@@ -51,6 +51,7 @@ pub(super) fn execute(args: &BurstsArgs) -> CommandResult {
 
 fn text(report: &BurstsReport) -> String {
     let mut lines = vec![report.ledger.to_string()];
+    lines.extend(report.searched.iter().map(ToString::to_string));
     for event in &report.events {
         let [number, curves] = [event.event, event.light_curves];
         lines.push(format!("event {number}: light curves of {curves} channels"));

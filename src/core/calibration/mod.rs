@@ -30,7 +30,8 @@ pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 #[doc(hidden)]
 pub use bursts::{
     BurstAlert, BurstChoice, BurstEvent, BurstSearch, BurstSummary, ChannelCurve, DividedBlock, FluxPoint,
-    FoundBurst, FoundBursts, LightCurve, PassAlerts, find_alerts, find_bursts, find_events,
+    FoundBurst, FoundBursts, LightCurve, PassAlerts, PassCounts, SearchedChannel, SearchedPasses,
+    find_alerts, find_bursts, find_events,
 };
 #[doc(hidden)]
 pub use config::{CalibrationConfig, CalibrationHook};

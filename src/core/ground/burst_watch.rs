@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::mem;
 
 use super::DeliveredPacket;
-use crate::calibration::{BurstSearch, FoundBurst, FoundBursts, PassAlerts, find_alerts, find_bursts};
+use crate::calibration::{BurstSearch, FoundBursts, PassAlerts, SearchedChannel, find_alerts, find_bursts};
 use crate::downlink::receive::SendingKey;
 use crate::frames::{PlacedFrame, PlacedVisibilities};
 use crate::units::ChannelId;
@@ -100,13 +100,19 @@ impl BurstWatch {
         channels.map(|channel| channel.blocks.into_iter().map(|block| block.placed).collect()).collect()
     }
 
-    /// Ends the open pass: adds its bursts to a table, and returns the blocks of channels with bursts.
+    /// Ends the open pass: adds its bursts to a table, counts it there, and returns the blocks of channels with bursts.
     pub(super) fn end(&mut self, search: BurstSearch, bursts: &FoundBursts) -> Vec<WatchedBlock> {
         let Self { channels, .. } = mem::take(self);
         let mut disturbed = Vec::new();
-        for WatchedChannel { blocks, .. } in channels.into_values() {
-            let placed: Vec<&PlacedVisibilities> = blocks.iter().map(|block| &block.placed).collect();
-            let mut found: Vec<FoundBurst> = find_bursts(search, &placed);
+        let searched = |channel: &WatchedChannel| {
+            let placed: Vec<&PlacedVisibilities> = channel.blocks.iter().map(|block| &block.placed).collect();
+            find_bursts(search, &placed)
+        };
+        let searched: Vec<SearchedChannel> = channels.values().map(searched).collect();
+        bursts.add_pass(&searched);
+        for (WatchedChannel { blocks, .. }, SearchedChannel { bursts: mut found, .. }) in
+            channels.into_values().zip(searched)
+        {
             // By a session that had the first visibilities of the pass.
             found.retain(|burst| !bursts.knows(burst));
             let has_new = found.into_iter().filter(|burst| bursts.add(burst.clone())).count() > 0;

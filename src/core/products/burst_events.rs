@@ -11,7 +11,7 @@ use crate::calibration::{BurstEvent, FluxPoint};
 /// Columns of a picture.
 const COLUMNS: usize = 512;
 
-/// Writes the light curves of all channels as `event-N.csv` and the dynamic spectrum as `event-N.png`; nothing without light curves.
+/// Writes the light curves of all channels as `event-0001.csv` and so on and the dynamic spectrum as `event-0001.png`; nothing without light curves.
 ///
 /// # Errors
 /// Files that cannot be written.

@@ -138,7 +138,8 @@ pub(in crate::pipeline) fn collect_summary(
     (summary.listening, summary.samples) = (listening, samples);
     summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
     summary.saving = ground.saving.report();
-    summary.bursts = BurstSummary::new(ground.bursts.choice(), ground.bursts.list());
+    let bursts = &ground.bursts;
+    summary.bursts = BurstSummary::new(bursts.choice(), bursts.list(), bursts.searched());
     let gains = ground.gains.as_ref().map(|gains| GainsWriter::new(config, out).write(gains));
     summary.calibration = gains.transpose()?;
     Ok(summary)

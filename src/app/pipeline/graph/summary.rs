@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::found_solutions::CalibrateSummary;
 use super::ground_segment::SOLVE;
 use super::sample_summary::SampleSummary;
-use crate::calibration::{BurstChoice, BurstSummary, Completeness, FoundBurst};
+use crate::calibration::{BurstChoice, BurstSummary, Completeness, FoundBurst, SearchedPasses};
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenReport;
 use crate::frames::VisibilityReason;
@@ -70,7 +70,7 @@ pub struct RunSummary {
     /// Summary of the solved gains, with `calibration.hook = "solve"`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<CalibrateSummary>,
-    /// Bursts of point sources that were found; absent if there are none.
+    /// Bursts of point sources; absent if they were not looked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bursts: Option<BurstSummary>,
     /// The joint maps; absent without any.
@@ -128,12 +128,11 @@ impl RunSummary {
             space_hash: earlier.space_hash.or(self.space_hash),
             channels: [earlier.channels, self.channels].concat(),
             ledger,
-            bursts: match (earlier.bursts.is_empty(), self.bursts) {
-                (true, ours) => ours,
-                (false, ours) => {
-                    let ours = ours.map(|bursts| bursts.bursts).unwrap_or_default();
-                    BurstSummary::new(action, [earlier.bursts, ours].concat())
-                }
+            bursts: {
+                let ours = self.bursts.map(|ours| (ours.bursts, ours.searched)).unwrap_or_default();
+                let (bursts, searched) =
+                    ([earlier.bursts, ours.0].concat(), [earlier.searched, ours.1].concat());
+                BurstSummary::new(action, bursts, searched)
             },
             ..self
         }
@@ -185,6 +184,7 @@ pub(in crate::pipeline) struct GroupRecord {
     pub(in crate::pipeline) seed: Option<u64>,
     pub(in crate::pipeline) space_hash: Option<String>,
     pub(in crate::pipeline) bursts: Vec<FoundBurst>,
+    pub(in crate::pipeline) searched: Vec<SearchedPasses>,
 }
 
 /// Maximum size of a record, bytes: a channel's curves take some 100 kB.
@@ -213,6 +213,7 @@ impl GroupRecord {
             seed: summary.seed,
             space_hash: summary.space_hash.clone(),
             bursts: summary.bursts.as_ref().map(|bursts| bursts.bursts.clone()).unwrap_or_default(),
+            searched: summary.bursts.as_ref().map(|bursts| bursts.searched.clone()).unwrap_or_default(),
         })
     }
 

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::calibration::{BurstChoice, BurstEvent, BurstSearch, FoundBurst, find_events};
+use crate::calibration::{
+    BurstChoice, BurstEvent, BurstSearch, FoundBurst, PassCounts, SearchedPasses, find_events,
+};
 use crate::frames::VisibilityReason;
 use crate::ground::{WAIT_BYTES, read_passes};
 use crate::pipeline::config::{Config, PipelineError};
@@ -16,8 +18,10 @@ use crate::runtime::{Ledger, LedgerReport};
 /// What was found in downlink files.
 #[derive(Clone, Debug, Serialize)]
 pub struct BurstsReport {
-    /// All visibilities; those accumulated were searched.
+    /// All visibilities; those accumulated were searched, but for the passes that `searched` counts as not.
     pub ledger: LedgerReport<VisibilityReason>,
+    /// The passes of each channel that were searched.
+    pub searched: Vec<SearchedPasses>,
     /// The events, in the order of their passes.
     pub events: Vec<EventReport>,
 }
@@ -50,7 +54,7 @@ pub fn bursts_of_downlink(
     let _lock = lock_folder(out)?;
     let earlier = events_of(&out.join("summary.json"));
     let ledger = Ledger::new();
-    let (mut events, mut failure) = (Vec::new(), None);
+    let (mut events, mut failure, mut counts) = (Vec::new(), None, PassCounts::default());
     let mut write = |event: BurstEvent| {
         let number = events.len() + 1;
         failure = failure.take().or_else(|| write_event(out, number, &event).err());
@@ -65,13 +69,13 @@ pub fn bursts_of_downlink(
     read_passes(&config.ground(WAIT_BYTES), files, &ledger, &mut |instrument, channels| {
         let (moon_radius_m, epoch_tai_s) = (instrument.moon_radius_m, instrument.epoch_tai_s);
         let search = BurstSearch { moon_radius_m, epoch_tai_s, choice: BurstChoice::Keep };
-        find_events(search, channels).into_iter().for_each(&mut write);
+        find_events(search, channels, &mut counts).into_iter().for_each(&mut write);
     })?;
     if let Some(error) = failure {
         return Err(error.into());
     }
     (events.len() + 1..=earlier).for_each(|number| remove_event(out, number));
-    let report = BurstsReport { ledger: ledger.balanced_report()?, events };
+    let report = BurstsReport { ledger: ledger.balanced_report()?, searched: counts.list(), events };
     write_json(&out.join("summary.json"), &report)?;
     Ok(report)
 }

@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::detect::{Entry, pairs_of, rows_of};
 use super::flux::{Flux, affordable};
 use super::rows::{BurstRow, Place};
-use super::{BurstSearch, FoundBurst, find_bursts};
+use super::{BurstSearch, FoundBurst, PassCounts, SearchedChannel, find_bursts};
 use crate::frames::PlacedVisibilities;
 use crate::numerics::median;
 use crate::sky::k_sr_per_jy;
@@ -67,13 +67,19 @@ pub struct BurstEvent {
     pub curves: Vec<ChannelCurve>,
 }
 
-/// Finds the events in the visibilities of a pass, by channel.
+/// Finds the events in the visibilities of a pass, by channel, and counts the pass.
 #[must_use]
-pub fn find_events(search: BurstSearch, channels: &[Vec<PlacedVisibilities>]) -> Vec<BurstEvent> {
-    let blocks = |channel: &Vec<PlacedVisibilities>| -> Vec<FoundBurst> {
+pub fn find_events(
+    search: BurstSearch,
+    channels: &[Vec<PlacedVisibilities>],
+    counts: &mut PassCounts,
+) -> Vec<BurstEvent> {
+    let searched = |channel: &Vec<PlacedVisibilities>| -> SearchedChannel {
         find_bursts(search, &channel.iter().collect::<Vec<_>>())
     };
-    let mut bursts: Vec<FoundBurst> = channels.iter().flat_map(blocks).collect();
+    let searched: Vec<SearchedChannel> = channels.iter().map(searched).collect();
+    counts.add_pass(&searched);
+    let mut bursts: Vec<FoundBurst> = searched.into_iter().flat_map(|channel| channel.bursts).collect();
     bursts.sort_by(|a, b| a.from_s.total_cmp(&b.from_s).then(a.channel.cmp(&b.channel)));
     let mut events: Vec<BurstEvent> = Vec::new();
     for burst in bursts {

@@ -24,6 +24,7 @@ use super::flux::{Flux, affordable};
 use super::locate::{Sample, locate};
 use super::refine::{name, refine};
 use super::rows::{BurstRow, Place};
+use super::searched::{BIN_S, PAIRS_MIN, PAIRS_OF_POWERS_MIN, SearchedChannel, VISIBILITIES_MIN};
 use super::{BurstChoice, BurstSearch, FoundBurst, LightCurve};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::{median, percentiles};
@@ -49,18 +50,6 @@ const LEVEL_S: f64 = 450.0;
 
 /// Least number of bins with powers on either side. At the ends of a pass powers are not judged.
 const LEVEL_BINS_MIN: usize = 3;
-
-/// Least number of pairs in a bin. Half of the six pairs of four daughters, or less of more, have the same daughter.
-const PAIRS_MIN: usize = 6;
-
-/// The same for powers: a direction takes three.
-const PAIRS_OF_POWERS_MIN: usize = 3;
-
-/// Least number of visibilities of a pair, for its quartile.
-const VISIBILITIES_MIN: usize = 8;
-
-/// Shortest and longest bin, s. Sparser visibilities are not judged.
-const BIN_S: [f64; 2] = [10.0, 300.0];
 
 /// Number of bins, the brightest, that a position is found with.
 const BRIGHTEST: usize = 3;
@@ -102,9 +91,15 @@ impl Entry<'_> {
 
 /// Finds the bursts in the visibilities of a pass in one channel.
 #[must_use]
-pub fn find_bursts(search: BurstSearch, blocks: &[&PlacedVisibilities]) -> Vec<FoundBurst> {
+pub fn find_bursts(search: BurstSearch, blocks: &[&PlacedVisibilities]) -> SearchedChannel {
+    let nothing = SearchedChannel {
+        channel: blocks.first().map_or(0, |block| block.channel.0),
+        frequency_hz: blocks.first().map_or(0.0, |block| block.frequency_hz),
+        visibilities: blocks.iter().map(|block| block.len()).sum(),
+        ..SearchedChannel::default()
+    };
     let pairs = pairs_of(blocks, VISIBILITIES_MIN);
-    let Some(bins) = Bins::new(&pairs) else { return Vec::new() };
+    let Some(bins) = Bins::new(&pairs) else { return nothing };
     let bins = bins.judged(&pairs, 0, |_| true);
     let ranges = bins.detections();
     let described = bins.strongest(&ranges, DESCRIBED_MAX);
@@ -112,7 +107,8 @@ pub fn find_bursts(search: BurstSearch, blocks: &[&PlacedVisibilities]) -> Vec<F
         let noted = note(search, &bins, range, &pairs)?;
         Some(if described.contains(&index) { describe(search, &bins, range, &pairs, noted) } else { noted })
     };
-    ranges.iter().enumerate().filter_map(burst).collect()
+    let bursts = ranges.iter().enumerate().filter_map(burst).collect();
+    SearchedChannel { judged: bins.judged_visibilities(&pairs), bursts, ..nothing }
 }
 
 /// The visibilities of each pair and band that has some number of them.
@@ -249,6 +245,12 @@ impl Bins {
             (powers[bin] > 0.0).then(|| powers[bin] / before.max(after) - 1.0)
         };
         (0..powers.len()).map(|bin| rise(bin).unwrap_or(0.0)).collect()
+    }
+
+    /// Number of visibilities in bins with a statistic. Powers that are all the same, of weights without any, have none.
+    fn judged_visibilities(&self, pairs: &[Vec<Entry>]) -> usize {
+        let is_judged = |bin: usize| self.ratios[bin] > 0.0 || self.rises[bin] != 0.0;
+        pairs.iter().flatten().filter(|entry| is_judged(self.bin(entry.time_s()))).count()
     }
 
     /// The bins of each burst.

@@ -11,12 +11,14 @@ mod locate;
 mod peel;
 mod refine;
 mod rows;
+mod searched;
 
 pub use curve::{BurstEvent, ChannelCurve, FluxPoint, find_events};
 pub use detect::find_bursts;
 pub use early::{BurstAlert, PassAlerts, find_alerts};
 pub(super) use locate::{Sample, locate};
 pub use peel::LightCurve;
+pub use searched::{PassCounts, SearchedChannel, SearchedPasses};
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -199,6 +201,8 @@ pub struct BurstSummary {
     /// The bursts; a thousand of them in JSON.
     #[serde(serialize_with = "first_bursts")]
     pub bursts: Vec<FoundBurst>,
+    /// The passes of each channel that were searched.
+    pub searched: Vec<SearchedPasses>,
 }
 
 fn first_bursts<S: Serializer>(bursts: &[FoundBurst], serializer: S) -> Result<S::Ok, S::Error> {
@@ -240,9 +244,9 @@ impl BurstHours {
 }
 
 impl BurstSummary {
-    /// The summary of some bursts; `None` if there are none.
+    /// The summary of some bursts and passes; `None` if there are neither.
     #[must_use]
-    pub fn new(action: BurstChoice, bursts: Vec<FoundBurst>) -> Option<Self> {
+    pub fn new(action: BurstChoice, bursts: Vec<FoundBurst>, searched: Vec<SearchedPasses>) -> Option<Self> {
         let hats = pixel_directions(NSIDE);
         let mut channels: BTreeMap<u16, BurstHours> = BTreeMap::new();
         for burst in &bursts {
@@ -257,7 +261,8 @@ impl BurstSummary {
             channel.add(burst, action != BurstChoice::Keep, &hats);
         }
         let found = bursts.len() as u64;
-        (found > 0).then(|| Self { action, found, channels: channels.into_values().collect(), bursts })
+        let channels = channels.into_values().collect();
+        (found > 0 || !searched.is_empty()).then_some(Self { action, found, channels, bursts, searched })
     }
 }
 
@@ -268,7 +273,10 @@ impl fmt::Display for BurstSummary {
             BurstChoice::Peel => "subtracted",
             BurstChoice::Off | BurstChoice::Keep => "kept in the maps",
         };
-        write!(f, "{} bursts, {what}:", self.found)?;
+        match self.found {
+            0 => write!(f, "none found")?,
+            found => write!(f, "{found} bursts, {what}:")?,
+        }
         for of_channel in &self.channels {
             let hz = Dimension::Frequency.show(of_channel.frequency_hz);
             let BurstHours { found, without_direction, hours, hours_left_out, .. } = of_channel;
@@ -282,6 +290,9 @@ impl fmt::Display for BurstSummary {
             if most > 0.0 {
                 write!(f, " ({least:.2} to {most:.2} by direction)")?;
             }
+        }
+        for passes in self.searched.iter().filter(|passes| passes.not_searched > 0) {
+            write!(f, "\n  {passes}")?;
         }
         Ok(())
     }
@@ -309,6 +320,8 @@ struct BurstTable {
     alerts: Vec<BurstAlert>,
     /// Number of those that were not told.
     untold: u64,
+    /// Passes of any session.
+    passes: PassCounts,
 }
 
 impl BurstTable {
@@ -434,11 +447,23 @@ impl FoundBursts {
         self.choice == BurstChoice::Peel && self.table().bursts.iter().any(is_in)
     }
 
-    /// Resumes with the bursts of earlier sessions.
-    pub fn resume(&self, bursts: Vec<FoundBurst>) {
+    /// Resumes with the bursts and passes of earlier sessions.
+    pub fn resume(&self, bursts: Vec<FoundBurst>, searched: Vec<SearchedPasses>) {
         let mut table = self.table();
         *table = BurstTable { earlier: bursts.len(), ..BurstTable::default() };
         bursts.into_iter().for_each(|burst| table.add(burst));
+        searched.into_iter().for_each(|passes| table.passes.add(passes));
+    }
+
+    /// Counts a pass.
+    pub fn add_pass(&self, channels: &[SearchedChannel]) {
+        self.table().passes.add_pass(channels);
+    }
+
+    /// The passes of each channel that were searched, in any session.
+    #[must_use]
+    pub fn searched(&self) -> Vec<SearchedPasses> {
+        self.table().passes.list()
     }
 
     /// All bursts, in the order in which they were found.

@@ -2,6 +2,7 @@
 
 mod arrival;
 mod curves;
+mod searched;
 mod turning;
 
 use num_complex::Complex64;
@@ -58,7 +59,7 @@ fn pass(
 }
 
 fn found(blocks: &[PlacedVisibilities]) -> Vec<FoundBurst> {
-    find_bursts(SEARCH, &blocks.iter().collect::<Vec<_>>())
+    find_bursts(SEARCH, &blocks.iter().collect::<Vec<_>>()).bursts
 }
 
 fn array() -> Array {
@@ -393,7 +394,7 @@ fn visibilities_that_arrive_later_are_peeled_once_by_each_burst() {
     let mut early = blocks[0].without_visibilities();
     (0..103).for_each(|k| early.push_from(&blocks[0], k));
     let fitted: Vec<_> = [&early].into_iter().chain(&blocks[1..]).collect();
-    let [of_early] = &find_bursts(SEARCH, &fitted)[..] else { panic!() };
+    let [of_early] = &find_bursts(SEARCH, &fitted).bursts[..] else { panic!() };
     let of_part = FoundBursts::new(BurstChoice::Peel);
     of_part.add(of_early.clone());
     let parts = of_part.divided(&blocks[0], 0).unwrap();

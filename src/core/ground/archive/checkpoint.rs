@@ -186,6 +186,9 @@ pub(in crate::ground) fn read_from<T>(
     if !head.calibration.bursts.iter().all(|burst| burst.is_sound(channels)) {
         return Err(damaged("invalid bursts".into(), "bursts in channels of the instrument"));
     }
+    if !head.calibration.searched.iter().all(|passes| passes.is_sound(channels)) {
+        return Err(damaged("invalid passes".into(), "passes of channels of the instrument"));
+    }
     let mut sums = from.take(bytes - FIXED_BYTES - length);
     let found = rest(head, &mut sums)?;
     match sums.limit() {
@@ -229,6 +232,11 @@ fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize
         calibration.bursts = bursts;
         more += last;
     }
+    if used + more < bytes.len() {
+        let (searched, last) = bincode::decode_from_slice(&bytes[used + more..], config)?;
+        calibration.searched = searched;
+        more += last;
+    }
     let head =
         ArchiveHead { settings, collector, ephemeris, autos, accumulator, journal, calibration, checksum: 0 };
     Ok((head, used + more))
@@ -270,7 +278,7 @@ mod tests {
     use num_complex::Complex32;
 
     use super::*;
-    use crate::calibration::{Calibrator, Identity};
+    use crate::calibration::{Calibrator, Identity, SearchedPasses};
     use crate::downlink::receive::PacketOutcome;
     use crate::downlink::{
         CucTime, DownlinkConfig, FORMAT_VERSION, PacketHeader, PacketKind, PacketSegment, Transmission,
@@ -337,6 +345,13 @@ mod tests {
         let packet = DeliveredPacket { header, checksum: 1, counts: PacketOutcome::default() };
         journal.record_visibilities(&packet, RecordDraft::default(), &ledger.report());
         let settings = vec![("map.nside".to_owned(), "4".to_owned())];
+        let searched = SearchedPasses {
+            channel: 0,
+            frequency_hz: 3e6,
+            passes: 5,
+            not_searched: 4,
+            not_searched_beside_burst: 3,
+        };
         take(&ArchiveHeadView {
             settings: &settings,
             collector: collector.view(),
@@ -344,7 +359,7 @@ mod tests {
             autos: calibrator.autos().unwrap(),
             accumulator: accumulator.state(),
             journal: &journal,
-            calibration: CalibrationState::default(),
+            calibration: CalibrationState { searched: vec![searched], ..CalibrationState::default() },
         })
     }
 
@@ -378,6 +393,7 @@ mod tests {
             ("autos", length(bincode::encode_to_vec(head.autos, config))),
             ("accumulator", length(bincode::encode_to_vec(&head.accumulator, config))),
             ("journal", length(bincode::encode_to_vec(head.journal, config))),
+            ("calibration", length(bincode::encode_to_vec(&head.calibration, config))),
             ("engines", 7),
             ("checksum", 8),
         ];
@@ -454,6 +470,7 @@ mod tests {
         with_head(|head| {
             let found = read_back(&written(head)).unwrap();
             assert_eq!(found.journal, *head.journal);
+            assert_eq!(found.calibration, head.calibration);
             assert_eq!(found.ephemeris.iter().collect::<Vec<_>>(), head.ephemeris);
             assert_eq!(found.accumulator, head.accumulator);
             assert!(found.autos == *head.autos && found.autos != AutoTable::default());

@@ -206,6 +206,7 @@ impl<'a> ArchiveHeadRef<'a> {
                 version: self.version,
                 passes: gate.map(PassGate::state).unwrap_or_default(),
                 bursts: calibrator.bursts().list(),
+                searched: calibrator.bursts().searched(),
             },
         }
     }

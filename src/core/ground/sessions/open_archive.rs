@@ -56,6 +56,7 @@ impl ArchiveContents {
         }
         self.calibration.version = self.calibration.version.max(other.calibration.version);
         self.calibration.bursts.extend(other.calibration.bursts);
+        self.calibration.searched.extend(other.calibration.searched);
         self.journal.merge(other.journal).map_err(|count| {
             let apid = PacketKind::Visibilities.apid();
             DownlinkError::DuplicatePacket { apid, count }
@@ -197,7 +198,7 @@ impl OpenArchive {
         }
         outcome.gains = gate.as_ref().map(|gate| gate.gains().clone());
         let calibrator = config.calibrator(gate.as_ref(), &posts)?;
-        calibrator.bursts().resume(calibration.bursts);
+        calibrator.bursts().resume(calibration.bursts, calibration.searched);
         outcome.bursts = calibrator.bursts().clone();
         let calibrator = calibrator.resume(instrument, ephemeris, autos, journal.blocks());
         let collector = Collector::resume(collector, journal.delivered(), journal.reception());

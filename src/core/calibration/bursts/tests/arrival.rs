@@ -77,7 +77,7 @@ fn what_always_looks_like_bursts_has_few_alerts_and_directions() {
     let mut blocks = pass(&array, 400, from_s, n_hat, k_sr);
     blocks.retain(|block| block.pair.j < 5);
     let search = BurstSearch { choice: BurstChoice::Flag, ..SEARCH };
-    let found = find_bursts(search, &blocks.iter().collect::<Vec<_>>());
+    let found = find_bursts(search, &blocks.iter().collect::<Vec<_>>()).bursts;
     assert_eq!(found.len(), 30);
     for (index, burst) in found.iter().enumerate() {
         assert_eq!(!burst.positions_deg.is_empty(), index >= 14, "{burst}");
@@ -90,7 +90,7 @@ fn what_always_looks_like_bursts_has_few_alerts_and_directions() {
     }
     let bursts = FoundBursts::new(BurstChoice::Flag);
     found.into_iter().for_each(|burst| assert!(bursts.add(burst)));
-    let summary = BurstSummary::new(BurstChoice::Flag, bursts.list()).unwrap();
+    let summary = BurstSummary::new(BurstChoice::Flag, bursts.list(), Vec::new()).unwrap();
     assert_eq!((summary.found, summary.channels[0].without_direction), (30, 14));
     assert!(summary.to_string().contains("14 without direction"), "{summary}");
     // Looks at the open pass.

@@ -16,7 +16,9 @@ fn errors_of_curves(arcs_m: &[f64], seeds: std::ops::Range<u64>) -> Vec<[f64; 2]
         let peak_k_sr = 60.0 * STEADY_K_SR * (0.8 * normal().clamp(-3.0, 3.0)).exp();
         let from_s = seen_from_s(&array, n_hat);
         let blocks = pass_of_burst(&array, &mut stream, from_s, (n_hat, peak_k_sr), seed % 2 == 0);
-        let [event] = &find_events(search, &[blocks])[..] else { panic!("{seed}") };
+        let [event] = &find_events(search, &[blocks], &mut PassCounts::default())[..] else {
+            panic!("{seed}")
+        };
         let [curve] = &event.curves[..] else { panic!("{seed}") };
         assert!(curve.is_found && event.bursts.len() == 1);
         // The margins on both sides, but less than a value at the end.
@@ -67,7 +69,7 @@ fn bursts_that_overlap_in_any_channel_are_one_event() {
         }
         blocks
     });
-    let events = find_events(SEARCH, &channels.collect::<Vec<_>>());
+    let events = find_events(SEARCH, &channels.collect::<Vec<_>>(), &mut PassCounts::default());
     let bursts: Vec<Vec<u16>> =
         events.iter().map(|event| event.bursts.iter().map(|burst| burst.channel).collect()).collect();
     assert_eq!(bursts, [vec![0, 1], vec![0]]);
@@ -77,7 +79,7 @@ fn bursts_that_overlap_in_any_channel_are_one_event() {
         let beyond = quiet.iter().filter(|point| point.flux_jy.abs() > 4.0 * point.sigma_jy).count();
         assert!(!quiet.is_empty() && beyond == 0, "{quiet:?}");
     }
-    assert!(find_events(SEARCH, &[]).is_empty());
+    assert!(find_events(SEARCH, &[], &mut PassCounts::default()).is_empty());
 }
 
 #[test]
