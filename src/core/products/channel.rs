@@ -6,7 +6,7 @@ use super::beam::EffectiveBeam;
 use super::comparison_pictures::{draw_comparison, draw_relative_error};
 use super::config::{PostProcessing, ProductsConfig};
 use super::error::{ProductsError, create_folder, write_product};
-use super::error_maps::{ErrorMap, limits};
+use super::error_maps::{ErrorMap, errors_low_by, limits};
 use super::latitudes::latitude_errors;
 use super::pictures::{
     Bars, ColourScale, MapPanel, Palette, Picture, Sampling, Scaling, Sheet, View, draw_map, draw_sheet,
@@ -264,6 +264,8 @@ impl ChannelFolder {
             dipole_k: uncertainty.map(|found| found.dipole_k),
             dipole_sigma_k: uncertainty.map(|found| found.dipole_sigma_k),
             sky_power: uncertainty.map(|found| found.power.clone()),
+            errors_low_by: uncertainty
+                .and_then(|found| errors_low_by(&found.power, &solution.diagnostics, solution.visibilities)),
             gain_errors: uncertainty.and_then(|found| found.gains.clone()),
             interrupted: solution.interruption(),
             noise_rms_k: match solution.is_interrupted {
@@ -343,6 +345,10 @@ impl ChannelFolder {
                 if map.file != "resolution.fits" {
                     let Solution { diagnostics, refinement, .. } = origin.solution;
                     cards.push(Card::text("ERRORS", limits(diagnostics, refinement.as_ref()), ""));
+                    let visibilities = origin.solution.visibilities;
+                    if let Some(factor) = errors_low_by(&errors.power, diagnostics, visibilities) {
+                        cards.push(Card::real("ERRLOW", factor, "times too small, by the sky beyond l_max"));
+                    }
                 }
                 self.register_file(map.file);
                 map.write(&self.root.join(&self.name), &WriteOptions { cards, ..WriteOptions::default() })?;

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::imaging::anywhere::Refinement;
-use crate::imaging::{Diagnostics, Sample, Uncertainty};
+use crate::imaging::{Diagnostics, Sample, SkyPower, Uncertainty};
 use crate::sky::Frame;
 use crate::sky::fits::{Column, FitsError, WriteOptions, write_columns};
 
@@ -60,6 +60,15 @@ pub(super) fn limits(diagnostics: &Diagnostics, refinement: Option<&Refinement>)
         (None, Some(_)) => "degrees up to l_max",
         (None, None) => "all degrees, also those beyond the map's",
     }
+}
+
+/// Factor of errors from which it is said that they are too small.
+const LOW: f64 = 1.4;
+
+/// By how much errors of a harmonic map are too small, if that is to be said. Those of pixel maps have the sky's other degrees.
+pub(super) fn errors_low_by(power: &SkyPower, diagnostics: &Diagnostics, visibilities: u64) -> Option<f64> {
+    let is_of_harmonics = diagnostics.convergence.is_some() && !diagnostics.is_of_pixels;
+    Some(power.errors_low_by(visibilities)).filter(|factor| is_of_harmonics && *factor >= LOW)
 }
 
 /// A vector with the standard deviation of each component, in words.

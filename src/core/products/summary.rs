@@ -72,6 +72,9 @@ pub struct ChannelSummary {
     /// Angular power of the sky, whose inverse is R, with its uncertainty; absent unless R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sky_power: Option<SkyPower>,
+    /// How many times too small errors are if the sky beyond the degrees solved for makes the residuals exceed the noise; absent below 1.4.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub errors_low_by: Option<f64>,
     /// The part of the errors of map and power that is by errors of the applied gains; absent where it is not among them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gain_errors: Option<GainUncertainty>,
@@ -152,11 +155,19 @@ impl ChannelSummary {
         };
         let constrained: f64 = power.constrained.iter().sum();
         let all = power.constrained.len().pow(2);
+        let low = self.errors_low_by.map(|factor| {
+            format!(
+                "\n             errors are too small, by some {factor:.1} times, unless it is noise of instruments by which residuals exceed the \
+                noise: baselines see the sky beyond l = {}; a larger map.nside or a smaller map.baseline_bp_max helps",
+                power.power_k2.len().saturating_sub(1)
+            )
+        });
         format!(
             "regulariser from the data: {constrained:.0} of {all} harmonics measured, residuals {:.2} times the noise; errors of pixels in \
-            sigma.fits ({})",
+            sigma.fits ({}){}",
             power.noise_factor,
-            limits(&self.diagnostics, self.refinement.as_ref())
+            limits(&self.diagnostics, self.refinement.as_ref()),
+            low.unwrap_or_default()
         )
     }
 }

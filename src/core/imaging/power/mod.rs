@@ -42,6 +42,9 @@ use crate::sky::healpix::pixel_count;
 
 /// Decades of amplitude that are searched, in units of the smallest noise variance.
 const DECADES: std::ops::RangeInclusive<i32> = -3..=13;
+/// Share of the power of residuals beyond the noise that the coefficients of a map take up, where it is of a sky with more degrees: 0.004 to 0.01 in full
+/// missions at nside 4 to 16 and 3 and 10 MHz (0.05 in one).
+const TAKEN: f64 = 0.007;
 /// Gain in evidence per step below which the iteration ends.
 const GAIN_MIN: f64 = 1e-4;
 
@@ -100,6 +103,15 @@ impl SkyPower {
         let first = self.power_k2.len();
         let fall = (last / before).ln() / (first as f64 / (first - 1) as f64).ln();
         last * ((l + 1) as f64 / first as f64).powf(fall)
+    }
+
+    /// How many times too small errors from so many visibilities are if residuals exceed the noise because the sky has more than the degrees solved
+    /// for: independent noise averages out in a coefficient, this sky does not. A rule, 1.2 times too high to 2.6 times too low in six simulated missions.
+    #[must_use]
+    pub fn errors_low_by(&self, visibilities: u64) -> f64 {
+        let excess = 1.0 - self.noise_factor.powi(-2);
+        let measured: f64 = self.constrained.iter().sum();
+        (1.0 + TAKEN * excess * 2.0 * visibilities as f64 / measured.max(1.0)).sqrt()
     }
 
     /// Converts an estimate from data divided by `factor`.

@@ -522,3 +522,29 @@ fn the_power_is_at_most_what_the_data_may_come_from() {
     let limited = expected(&found(&wild, true_power));
     assert!(limited < 1.5 * 30.0 * true_power, "{limited} {true_power}");
 }
+
+/// Runs of nside 8 at 1 MHz whose maps were compared with their skies by healpy: visibilities, harmonics measured, noise factor, and the root of
+/// the mean square of (map - sky) / sigma. A week, 30 and 100 days, 1.3 years.
+const LOW_ERRORS: [(u64, f64, f64, f64); 4] = [
+    (70_200, 384.0, 1.805, 2.77),
+    (75_104, 438.6, 2.051, 4.37),
+    (50_417, 440.5, 2.032, 3.07),
+    (240_430, 440.9, 1.867, 3.92),
+];
+
+#[test]
+fn errors_are_called_too_small_where_they_are() {
+    let of = |measured: f64, noise_factor: f64| SkyPower {
+        power_k2: vec![1.0],
+        sigma_ln: vec![0.0],
+        constrained: vec![measured],
+        noise_factor,
+    };
+    for (visibilities, measured, noise_factor, truth) in LOW_ERRORS {
+        let found = of(measured, noise_factor).errors_low_by(visibilities);
+        // The bounds that the documentation states.
+        assert!((truth / 2.6..1.2 * truth).contains(&found), "{found} {truth}");
+    }
+    // The same sky without what is beyond the map: 1.3 years, mean square 0.90.
+    assert!(of(441.0, 1.0).errors_low_by(240_430) == 1.0);
+}
