@@ -243,17 +243,3 @@ fn what_is_removed_leaves_nothing_in_any_order() {
     let alone = movers(kept, &[]);
     assert!(alone.0.len() > 4 && alone == movers(kept, gone) && alone == movers(&reversed, &[]));
 }
-
-/// Fewer data than the sky has unknowns: what a map can have instead has no flux.
-#[test]
-fn what_a_steady_sky_explains_has_no_flux() {
-    let blocks = geometry()[..2].to_vec();
-    assert!(2 * blocks.iter().map(PlacedVisibilities::len).sum::<usize>() < (DEGREE + 1).pow(2));
-    let columns = columns(&blocks);
-    let placed = with_values(&blocks, &simulated(2, &blocks, &columns));
-    let (found, _) = solved(&mut summed(&placed, &[]), (1e-12, &Regulariser::default()), None).unwrap();
-    let known: Vec<bool> = found.fluxes.iter().map(|flux| flux.flux_jy.is_some()).collect();
-    println!("{found} {known:?}");
-    assert!(!known.is_empty() && known.iter().all(|known| !known));
-    assert!(found.csv(LOW_HZ).lines().nth(1).unwrap().ends_with(",0,,"), "{}", found.csv(LOW_HZ));
-}
