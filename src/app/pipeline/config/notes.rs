@@ -167,7 +167,8 @@ impl Config {
     fn coverage_note(&self) -> Option<String> {
         let Self { array, map, spacecraft, joint, .. } = self;
         let turn = spacecraft.duration_s / array.precession_period_s;
-        if map.regulariser() != RegulariserChoice::Data || turn >= EVEN_SHARE {
+        // Orbits of their own turn otherwise, and stations have no node.
+        if map.regulariser() != RegulariserChoice::Data || turn >= EVEN_SHARE || array.has_own_orbits() {
             return None;
         }
         let is_large = (map.degree() + 1).pow(2) > WHOLE_UNKNOWNS_MAX || joint.on;
@@ -183,7 +184,7 @@ impl Config {
         let figures = match is_harmonic {
             false => "3 to 5 after a month at nside 8, means up to 5 sigma off",
             true => {
-                "3 after 200 days, 5 after a month, 300 after a week; of single maps with map.l_max up to 49 (nside 16) they hold"
+                "3 after 200 days, 5 after a month, 300 after a week; of single maps of nside 16 they hold"
             }
         };
         let (duration_s, turn_deg) = (spacecraft.duration_s, 360.0 * turn);
@@ -295,6 +296,17 @@ mod tests {
         let whole =
             |config: &mut Config| (config.map.nside, config.spacecraft.duration_s) = (32, 400.0 * DAY_S);
         assert_eq!(notes(&whole), Vec::<String>::new());
+        // Pixels of an ellipse, of its whole turn, and of orbits of their own.
+        let mut config = Config::default();
+        (config.spacecraft.duration_s, config.array.eccentricity) = (7.0 * DAY_S, 0.02);
+        config.choose_engine(true);
+        assert_eq!(config.map.engine, EngineKind::Pixel);
+        assert!(config.coverage_note().unwrap().contains("of maps of pixels with R from the data"));
+        config.spacecraft.duration_s = 400.0 * DAY_S;
+        assert_eq!(config.coverage_note(), None);
+        config.spacecraft.duration_s = 7.0 * DAY_S;
+        config.array.oem = vec!["one.oem".into()];
+        assert_eq!(config.coverage_note(), None);
     }
 
     #[test]
